@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -40,6 +42,22 @@ def move(pose: torch.Tensor, action: torch.Tensor, stride: float = STEP_M) -> to
     return planar_pose(x, y, pose[:, 2], heading)
 
 
+@lru_cache
+def _spec_of(flaw: str, height: int, width: int) -> Spec:
+    posed = flaw != "blind"
+    return Spec(
+        name=f"panorama {flaw}".strip(),
+        action=spaces.MultiBinary(3),
+        channels={
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            **({"pose": spaces.Box(-np.inf, np.inf, (7,), np.float32)} if posed else {}),
+        },
+        observes=("rgb", "pose") if posed else ("rgb",),
+        dt_s=1 / 35,
+        action_names=("FORWARD", "LEFT", "RIGHT"),
+    )
+
+
 @dataclass(frozen=True)
 class Panorama:
     """Knows the truth. flaw: "static" shows its last frame for ever; "deaf" ignores the actions; "long" strides 10%
@@ -50,18 +68,7 @@ class Panorama:
 
     @property
     def spec(self) -> Spec:
-        posed = self.flaw != "blind"
-        return Spec(
-            name=f"panorama {self.flaw}".strip(),
-            action=spaces.MultiBinary(3),
-            channels={
-                "rgb": spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
-                **({"pose": spaces.Box(-np.inf, np.inf, (7,), np.float32)} if posed else {}),
-            },
-            observes=("rgb", "pose") if posed else ("rgb",),
-            dt_s=1 / 35,
-            action_names=("FORWARD", "LEFT", "RIGHT"),
-        )
+        return _spec_of(self.flaw, HEIGHT, WIDTH)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         if batch < 1:
@@ -105,6 +112,11 @@ class Panorama:
 
 def recording(episodes: int = 4, length: int = 200, seed: int = 0) -> SimpleNamespace:
     """What a clip cache of a player in the panorama looks like; keys are held for five to twenty steps."""
+    return copy.deepcopy(_recorded(episodes, length, seed, HEIGHT, WIDTH))
+
+
+@lru_cache
+def _recorded(episodes: int, length: int, seed: int, height: int, width: int) -> SimpleNamespace:
     rng, world = make_rng(seed), Panorama()
     poses, actions, ranges = [], [], []
     for episode in range(episodes):

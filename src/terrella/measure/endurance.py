@@ -193,7 +193,7 @@ def _units(kind: str, exam: Exam) -> list[Unit]:
     units, config, idle = [], exam.config, kind == "stillness"
     clips, steps = next(iter(exam.places.values())), config.still_steps if idle else config.long_steps
     for arm, world in exam.arms.items():
-        if not (_still_missing if idle else _missing)(exam, world):
+        if not _missing(kind, exam, world):
             lanes = min(config.long_rollouts, len(clips), world.spec.max_batch or config.long_rollouts)
             calls = {(arm, "observe"): lanes * clips[0].context, (arm, "imagine" + UNSEEN): lanes * steps}
             words = f"{arm}: {steps:,} steps {'idle' if idle else 'played'}"
@@ -215,26 +215,22 @@ def _report(kind: str, exam: Exam, results: ExamResults) -> ProbeReport:
     return whole
 
 
-def _missing(exam: Exam, world: World) -> str:
-    if not exam.config.long_steps:
+def _missing(kind: str, exam: Exam, world: World) -> str:
+    idle = kind == "stillness"
+    if not (exam.config.still_steps if idle else exam.config.long_steps):
         return "needs long rollouts, which are switched off"
-    return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
-
-
-def _still_missing(exam: Exam, world: World) -> str:
-    if not exam.config.still_steps:
-        return "needs long rollouts, which are switched off"
-    if not can_idle(world.spec):
+    if idle and not can_idle(world.spec):
         return "needs an action that does nothing"
     return "" if "rgb" in exam.shared(world, "rgb") else "needs rgb"
 
 
-def _probe(name: str, question: str, lead: str, missing) -> Probe:
-    return Probe(name, question, lead, missing, partial(_report, name), units=partial(_units, name))
+def _probe(name: str, question: str, lead: str) -> Probe:
+    missing, report, units = (partial(function, name) for function in (_missing, _report, _units))
+    return Probe(name, question, lead, missing, report, units=units)
 
 
-ENDURANCE = _probe("endurance", "A long rollout", LEAD, _missing)
-STILLNESS = _probe("stillness", "Does it fade without actions?", STILL_LEAD, _still_missing)
+ENDURANCE = _probe("endurance", "A long rollout", LEAD)
+STILLNESS = _probe("stillness", "Does it fade without actions?", STILL_LEAD)
 
 
 def _matched(mine: torch.Tensor, poses: torch.Tensor, album: Album, not_episode: torch.Tensor | None = None) -> _Looks:

@@ -51,9 +51,8 @@ class Series:
 
 
 Where = tuple[str, str, str, str, str]  # probe, channel, what, unit, place
-SeriesOf = Callable[
-    [Exam, ExamResults, str, str, Sequence[Clip], Results], list[Series]
-]  # exam, results, set, place, clips, dreamt
+# (exam, results, set of clips, place, clips, results of a rollout) -> series
+SeriesOf = Callable[[Exam, ExamResults, str, str, Sequence[Clip], Results], list[Series]]
 
 
 def report(exam: Exam, results: ExamResults, probe: str, series_of: SeriesOf) -> ProbeReport:

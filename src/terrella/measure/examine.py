@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from .clips import Clip, check_clips
+from .clips import check_clips
 from .closure import MEMORY
 from .endurance import ENDURANCE, STILLNESS
 from .error_series import drift_probe
-from .exam import CLIPS, LONG, Exam, ExamResults, Probe, dreams
+from .exam import LONG, Exam, ExamResults, Probe, dreams
 from .outcomes import OUTCOMES
 from .page import page
 from .pixels import PIXELS
@@ -103,8 +103,9 @@ def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path,
 
 
 def _places(exam: Exam) -> list[PlaceSummary]:
-    def summary(name: str, clips: Sequence[Clip]) -> PlaceSummary:
-        moving = sum(clip.moves() for clip in clips) / len(clips)
-        return PlaceSummary(name, len(clips), moving, clips[0].context, clips[0].horizon)
-
-    return [summary(name, clips) for name, clips in exam.sets[CLIPS].items()]
+    return [
+        PlaceSummary(
+            name, len(clips), sum(clip.moves() for clip in clips) / len(clips), clips[0].context, clips[0].horizon
+        )
+        for name, clips in exam.places.items()
+    ]

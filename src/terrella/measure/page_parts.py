@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
@@ -43,11 +43,6 @@ def legend(lines: Sequence[Line]) -> str:
         for line in lines
     )
     return f"<figcaption>{keys}</figcaption>"
-
-
-def keys_of(colours: Mapping[str, str]) -> str:
-    """The legend of a chart: label -> colour."""
-    return legend([Line(label, (), (), (), (), colour) for label, colour in colours.items()])
 
 
 def words_and_interval(words: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 
-from .page_parts import COLOURS, QUIET, document, keys_of, legend, section, table_of, words_and_interval
+from .page_parts import COLOURS, QUIET, document, legend, section, table_of, words_and_interval
 from .plot import Line, line_chart, y_span
 from .plot_points import ScatterPoint, dot_plot, scatter
 from .policy_evaluation import (
@@ -80,10 +80,11 @@ def _dot_plot(evaluation: PolicyEvaluation) -> str:
     rows = [(name, [(evaluation.rows[name][arm], colour) for arm, colour in shown.items()]) for name in names]
     floor = evaluation.rows.get(RANDOM)
     guides = [(floor[REAL if real else DREAM].value, QUIET)] if floor else []
-    keys = {{REAL: "in reality", DREAM: "in the dream"}[arm]: colour for arm, colour in shown.items()}
-    keys |= {"acting at random" + (" in reality" if real else ""): QUIET} if floor else {}
+    names_of = {REAL: "in reality", DREAM: "in the dream"}
+    keys = [Line(names_of[arm], (), (), (), (), colour) for arm, colour in shown.items()]
+    keys += [Line("acting at random" + (" in reality" if real else ""), (), (), (), (), QUIET)] if floor else []
     label = "share of successes" if evaluation.what == SUCCESS else evaluation.what
-    return f'<div class=scroll><div style="min-width:560px">{dot_plot(rows, label, guides)}</div></div>{keys_of(keys)}'
+    return f'<div class=scroll><div style="min-width:560px">{dot_plot(rows, label, guides)}</div></div>{legend(keys)}'
 
 
 def _errors(evaluation: PolicyEvaluation) -> str:

@@ -51,9 +51,8 @@ def compare_transfer_arms(
     rng = torch.Generator().manual_seed(0)
     agreed = {}
     for name, played in inside.items():
-        pairs = [
-            (one, real[arm][seed]) for arm, seeds in played.items() for seed, one in seeds.items() if arm != ORACLE
-        ]
+        arms_of = {arm: seeds for arm, seeds in played.items() if arm != ORACLE}
+        pairs = [(one, real[arm][seed]) for arm, seeds in arms_of.items() for seed, one in seeds.items()]
         if len(pairs) > 2:
             dreamt, seen = (torch.stack([pair[at].float() for pair in pairs]) for at in (0, 1))
             agreed[name] = agreement(dreamt, seen, rng, 1.0)

@@ -111,24 +111,18 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
     sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
     main = {row.channel for row in sharp[:1]}
-    change = [
-        row
-        for row in mine
-        if (row.what, row.motion) == (CHANGE, PREDICTED) and row.channel in main and math.isfinite(row.figure.low)
-    ]
+    change = [row for row in mine if (row.what, row.motion) == (CHANGE, PREDICTED) and row.channel in main]
+    change = [row for row in change if math.isfinite(row.figure.low)]
     reach = max((row.horizon for row in sharp if row.horizon <= BLUR_STEPS), default=0)
     control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
+    control = [row for row in control if row.what.startswith(POOLED)] or control
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
-    stillness = [row for row in mine if row.probe == "stillness"]
     questions = (
-        (
-            _first([row for row in control if row.what.startswith(POOLED)] or control),
-            lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys"),
-        ),
+        (_first(control), lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys")),
         (closed, lambda row: _sure(row, REMEMBERED_DB, math.inf, "remembers", "does not surely remember", "forgets")),
         (_first([row for row in sharp if row.horizon == reach]), _sharpness),
         (_first([row for row in change if row.horizon == reach]), _moves),
-        (stillness, _stands),
+        ([row for row in mine if row.probe == "stillness"], _stands),
     )
     for rows, say in questions:
         if rows:

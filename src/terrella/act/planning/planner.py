@@ -115,8 +115,9 @@ class Planner:
         seeds = [later(episode.seed, 4 * episode.step + _PRIOR) for episode in memory]
         imagine = lambda part, rng: self.world.imagine(state.at(part), actions[part], rng)  # noqa: E731
         after = self._episode_seeds.run("imagine", imagine, seeds)
+        rest = [None if episode.queue is None else episode.queue[1:] for episode in memory]
         return actions, [
-            replace(episode, step=episode.step + 1, prior=after.at(entry), queue=_rest(episode.queue))
+            replace(episode, step=episode.step + 1, prior=after.at(entry), queue=rest[entry])
             for entry, episode in enumerate(memory)
         ]
 
@@ -218,10 +219,6 @@ class Planner:
                 raise PlanningError(f"the proposed policy is for other actions: {error}") from error
             plans.append(self.moves.codes(torch.stack(taken, 1)))
         return torch.stack(plans)
-
-
-def _rest(queue: torch.Tensor | None) -> torch.Tensor | None:
-    return None if queue is None else queue[1:]
 
 
 def _stacked(episodes: Sequence[PlannerMemory], name: str) -> torch.Tensor | None:
