@@ -225,8 +225,7 @@ def _missing(kind: str, exam: Exam, world: World) -> str:
 
 
 def _probe(name: str, question: str, lead: str) -> Probe:
-    missing, report, units = (partial(function, name) for function in (_missing, _report, _units))
-    return Probe(name, question, lead, missing, report, units=units)
+    return Probe(name, question, lead, partial(_missing, name), partial(_report, name), units=partial(_units, name))
 
 
 ENDURANCE = _probe("endurance", "A long rollout", LEAD)
