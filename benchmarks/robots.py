@@ -23,7 +23,7 @@ import tyro
 
 from terrella.core import make_rng
 from terrella.sim.mujoco_stepping import mujoco, rollout
-from terrella.sim.mujoco_world import MujocoWorld
+from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 from terrella.sim.randomised import Distribution, Randomised
 
 SHOWN = ("observation", "reward", "done")
@@ -37,11 +37,11 @@ ROUGH = {
 def main(
     robot: str = "ant", batch: int = 512, steps: int = 8, turns: int = 5, frames: int = 200, envs: int = 16
 ) -> None:
-    world = MujocoWorld(robot, cameras=())
+    world = MujocoWorld(robot, MujocoConfig(cameras=()))
     per = round(world.spec.dt_s / world.file.opt.timestep)
     found: dict[str, object] = {"robot": robot, "physics": world.spec.card["physics"], "batch": batch}
     for threads in (1, 2):
-        plain = MujocoWorld(robot, cameras=(), threads=threads)
+        plain = MujocoWorld(robot, MujocoConfig(cameras=(), threads=threads))
         rough = Randomised(plain, ROUGH)
         ways = {
             "bare": bare(plain, batch, steps, threads),
@@ -60,7 +60,7 @@ def main(
         if "mjbatch" in ways:
             told["share of bare, mjbatch"] = ratio(seconds, "bare", "mjbatch")
         found[f"{threads} threads"] = told
-    small = MujocoWorld(robot, size=(64, 64))
+    small = MujocoWorld(robot, MujocoConfig(size=(64, 64)))
     state = small.start(frames, make_rng(0))
     small.render(state.at(0), ("rgb",))
     seconds = in_turns({"rgb": lambda: small.render(state, ("rgb",))}, 3)["rgb"]
@@ -118,7 +118,7 @@ def by_mjbatch(world: MujocoWorld, batch: int, steps: int, threads: int) -> Call
 
 def against_async(envs: int, steps: int, turns: int) -> dict[str, object]:
     """Control steps a second of Ant-v5 in processes, and of the same ant in one State, at 0.05 s."""
-    ours = MujocoWorld("ant", cameras=(), control_s=0.05)
+    ours = MujocoWorld("ant", MujocoConfig(cameras=(), control_s=0.05))
     theirs = gymnasium.make_vec("Ant-v5", num_envs=envs, vectorization_mode="async")
     theirs.reset(seed=0)
 

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from terrella.core import Spec, State, World, make_rng, rollout
 from terrella.core.policy import Reactive
 from terrella.core.spec import DONE, REWARD
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 
 
 def plan(world: World, state: State, rng: torch.Generator, samples: int = 32, horizon: int = 20) -> torch.Tensor:
@@ -104,7 +104,7 @@ class LearnedCartPole:
 def main(steps: int = 200, episodes: int = 2, seed: int = 0) -> dict[str, float]:
     torch.set_num_threads(1)  # the network is so small that threads would only wait for each other
     rng = make_rng(seed)
-    truth = GymnasiumWorld("CartPole-v1", rgb=False)
+    truth = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False))
 
     stumble = Reactive(lambda seen, rng: truth.spec.sample_action(400, rng))
     stumbling = rollout(truth, truth.start(400, rng), stumble, rng, ("observation", "done"), steps=80)

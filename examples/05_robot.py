@@ -31,8 +31,8 @@ from terrella.serve import ServeConfig, serve
 from terrella.serve.agent import Agent, Agents
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import ROBOTS
-from terrella.sim.mujoco_tasks import rotated
-from terrella.sim.mujoco_world import MujocoWorld
+from terrella.sim.mujoco_tasks import rotate
+from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 
 POSTS = {"red": (3.0, 1.2), "green": (3.5, -1.0), "blue": (-1.0, 3.0)}  # x and y, m
 STEPS = 5  # control steps of 20 ms that a command lasts
@@ -84,7 +84,7 @@ class Walker:
     def __init__(self, name: str, gait: Path, draws: bool = True):
         self.body = BODIES[name]
         cameras = ("head", self.body.view) if draws else ()
-        self.sim = MujocoWorld(furnished(name), cameras=cameras, depth=draws, size=SIZE)
+        self.sim = MujocoWorld(furnished(name), MujocoConfig(cameras=cameras, depth=draws, size=SIZE))
         self.gait = terrella.load_policy(str(gait), self.sim.spec)
         own = self.sim.spec
         drawn = {name: space for name, space in own.channels.items() if name.split(".")[0] in ("rgb", "depth", "pose")}
@@ -128,11 +128,11 @@ class Walker:
 
     def before(self, state, place):
         """Where a place [B, 2] of the world is, forward and left of the body, m."""
-        qpos = state["physics"][:, self.sim.body.qpos]
+        qpos = state["physics"][:, self.sim.layout.qpos]
         away = torch.cat([place.double() - qpos[:, :2], torch.zeros(state.batch, 1)], 1)
         yaw = heading(qpos[:, 3:7])
         back = torch.stack([(yaw / 2).cos(), 0 * yaw, 0 * yaw, -(yaw / 2).sin()], 1)
-        return rotated(back, away)[:, :2].float()
+        return rotate(back, away)[:, :2].float()
 
 
 def free(*shape: int) -> spaces.Box:

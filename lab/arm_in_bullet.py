@@ -24,7 +24,7 @@ from terrella.core.policy import Policy
 from terrella.measure.policy_evaluation import percent
 from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import mujoco
-from terrella.sim.mujoco_world import MujocoWorld
+from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 
 
 class Arm:
@@ -95,14 +95,14 @@ def successes(world: MujocoWorld, policy: Policy, episodes: int, seed: int, arm:
         state = whole.at(torch.tensor([at]))
         memory, physics = policy.begin(1, rng), state["physics"]
         if arm is not None:
-            arm.begin(physics[0, world.body.qpos].numpy(), physics[0, world.body.qvel].numpy())
+            arm.begin(physics[0, world.layout.qpos].numpy(), physics[0, world.layout.qvel].numpy())
         for _ in range(world.spec.max_episode_steps or 200):
             action, memory = policy.act(world.render(state, ("observation",)), memory, rng)
             if arm is None:
                 state = world.imagine(state, action, rng)
             else:
                 qpos, qvel = (torch.from_numpy(found)[None] for found in arm.move(action.double().numpy()[0], steps))
-                state = world.replaced(state, state, qpos, qvel)
+                state = world.with_joints(state, state, qpos, qvel)
             if bool(world.render(state, ("success",))["success"] > 0):
                 count += 1
                 break
@@ -111,7 +111,7 @@ def successes(world: MujocoWorld, policy: Policy, episodes: int, seed: int, arm:
 
 def main(policies: tyro.conf.Positional[list[Path]], /, episodes: int = 300, seed: int = 1_000_003) -> None:
     torch.set_num_threads(1)
-    world = MujocoWorld("arm", cameras=(), threads=1)
+    world = MujocoWorld("arm", MujocoConfig(cameras=(), threads=1))
     arm = Arm(world.file, float(world.file.opt.timestep))
     for folder in policies:
         policy = terrella.load_policy(str(folder), world.spec)

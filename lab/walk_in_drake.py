@@ -51,7 +51,7 @@ from terrella.core.state import State
 from terrella.measure.policy_evaluation import percent
 from terrella.measure.statistics import clopper_pearson
 from terrella.sim.mujoco_model import FREE, mujoco
-from terrella.sim.mujoco_world import MujocoWorld
+from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 
 SETTLING = 50  # control steps whose velocity does not count: a second
 GEOM = mujoco.mjtGeom
@@ -176,24 +176,24 @@ class Walk:
 
 @torch.no_grad()
 def in_drake(walker: Walker, world: MujocoWorld, policy: Policy, starts: State, steps: int) -> Iterator[Walk]:
-    task, body = world.task, world.body
+    task, layout = world.task, world.layout
     for at in range(len(starts["physics"])):
         state, rng, seen, fell = starts.at(torch.tensor([at])), make_rng(at), [], False
         memory, physics = policy.begin(1, rng), state["physics"]
-        walker.begin(physics[0, body.qpos].numpy(), physics[0, body.qvel].numpy())
+        walker.begin(physics[0, layout.qpos].numpy(), physics[0, layout.qvel].numpy())
         for step in range(steps):
-            action, memory = policy.act({"observation": task.see(body, state, "observation")}, memory, rng)
+            action, memory = policy.act({"observation": task.render(layout, state, "observation")}, memory, rng)
             now_s = (step + 1) * world.spec.dt_s
             qpos, qvel = walker.move(action.double().numpy()[0], now_s)
             physics = physics.clone()
             physics[0, 0] = now_s
-            physics[0, body.qpos], physics[0, body.qvel] = torch.from_numpy(qpos), torch.from_numpy(qvel)
+            physics[0, layout.qpos], physics[0, layout.qvel] = torch.from_numpy(qpos), torch.from_numpy(qvel)
             after = state.replace(physics=physics, ctrl=action.double())
-            fell = bool(task.judge(body, dict(state.items()), dict(after.items()))[1])
+            fell = bool(task.evaluate(layout, dict(state.items()), dict(after.items()))[1])
             state = after
             if fell:
                 break
-            seen.append(task.see(body, state, "velocity")[0, :2])
+            seen.append(task.render(layout, state, "velocity")[0, :2])
         yield walk(fell, seen, state["command"][0, :2])
 
 
@@ -239,7 +239,7 @@ def main(
     seed: int = 12345,
 ) -> None:
     torch.set_num_threads(1)
-    world = MujocoWorld(robot, cameras=())
+    world = MujocoWorld(robot, MujocoConfig(cameras=()))
     walker, starts = Walker(world.file, step_s), world.start(episodes, make_rng(seed))
     for name in policies:
         policy = terrella.load_policy(name, world.spec)

@@ -82,9 +82,9 @@ def load(
         return Doom(DoomConfig(scenario=text.partition(":")[2] or GAME.partition(":")[2], **options))
     if text.startswith("mujoco:"):
         _require("mujoco", "MuJoCo's worlds need mujoco", "mujoco")
-        from .sim.mujoco_world import MujocoWorld
+        from .sim.mujoco_world import MujocoConfig, MujocoWorld
 
-        return MujocoWorld(text.partition(":")[2], **options)
+        return MujocoWorld(text.partition(":")[2], MujocoConfig(**options))
     if text.startswith("gym:"):
         return _open_gymnasium(*_id_and_repeat(text), options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
@@ -106,13 +106,13 @@ def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:
         from .sim.atari import AtariWorld
 
         return AtariWorld(env, repeat=repeat, **options)
-    from .sim.gymnasium import GymnasiumWorld
+    from .sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 
     if options.get("forkable") and _over_mujoco(env):
         from .sim.mujoco import MujocoSnapshots
 
         options = {"snapshots": MujocoSnapshots, **options}
-    return GymnasiumWorld(env, repeat=repeat, **options)
+    return GymnasiumWorld(env, GymnasiumConfig.of(repeat=repeat, **options))
 
 
 def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:

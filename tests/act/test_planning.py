@@ -22,7 +22,7 @@ from terrella.core import check_world, make_rng, rollout
 from terrella.core.errors import ChannelError, ContractError, ObservationError, PlanningError
 from terrella.core.policy import Random, Reactive
 from terrella.core.spec import Spec
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 
 AXES = ("cem", "icem", "mppi", "gradient", "random")
 GOAL = {"observation": torch.tensor([4.0, -3.0])}
@@ -217,14 +217,14 @@ def test_episodes_are_judged_from_unsolved_starts():
 
 
 def test_a_revealed_simulator_is_a_world():
-    world = FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False))
+    world = FullyObserved(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)))
     assert "observes" in check_world(world, steps=10)
     with pytest.raises(PlanningError, match="cannot be planned in"):
-        FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False, forkable=False))
+        FullyObserved(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False, forkable=False)))
 
 
 def test_a_planner_in_the_simulator_keeps_the_pole_up():
-    world = FullyObserved(GymnasiumWorld("CartPole-v1", rgb=False))
+    world = FullyObserved(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)))
     policy = Planner(world, negative_reward(world.spec), SearchConfig(samples=16, iterations=2, horizon=12, replan=3))
     mine = play(world, policy, 1, PlaySettings(200))
     floor = play(world, Random(world.spec), 8, PlaySettings(200))

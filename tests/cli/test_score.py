@@ -15,7 +15,7 @@ from terrella.cli import main
 from terrella.core import Spec, State, make_rng
 from terrella.core.policy import Random
 from terrella.data import Layout, Recorder, RecordOptions, record
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 from terrella.workflows.score import arms_of
 
 from ..data.layouts import layout_of
@@ -158,7 +158,7 @@ def test_a_recording_of_another_game_is_refused_in_one_sentence(names, tmp_path,
 
 def cart(folder, episodes: int = 6, length: int = 60):
     """CartPole under a player who leans against the pole, without pictures; ends where it falls."""
-    world, rng = GymnasiumWorld("CartPole-v1", rgb=False), make_rng(0)
+    world, rng = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), make_rng(0)
     with Recorder(folder, Layout.of(world.spec)) as recorder:
         for _ in range(episodes):
             state = world.start(1, rng)
@@ -177,7 +177,7 @@ class Cart:
     """CartPole as a learned world would hold it: goes on from what it observed. flaw: "numb" to the actions."""
 
     def __init__(self, flaw: str = ""):
-        whole = GymnasiumWorld("CartPole-v1", rgb=False).spec
+        whole = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)).spec
         channels = {name: whole.channels[name] for name in ("observation", "reward", "done")}
         self.flaw, self.spec = flaw, Spec("cart", whole.action, channels, ("observation",), whole.dt_s)
 

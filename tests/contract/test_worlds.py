@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 import terrella
 from terrella.core import check_world
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 from terrella.sim.replay import ReplayWorld
 
 from ..robot import Robot
@@ -29,7 +29,9 @@ def test_gymnasium_environments_that_can_be_copied(name):
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
 def test_gymnasium_environments_as_tickets(name):
-    assert "stale_states_are_refused" in check_world(GymnasiumWorld(name, rgb=False, forkable=False), steps=30)
+    assert "stale_states_are_refused" in check_world(
+        GymnasiumWorld(name, GymnasiumConfig(rgb=False, forkable=False)), steps=30
+    )
 
 
 def test_a_recorded_episode():

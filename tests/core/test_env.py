@@ -19,7 +19,7 @@ from terrella.core import Spec, State, WorldEnv, as_env, check_world, make_rng
 from terrella.core.errors import ActionError, ChannelError, TerrellaError
 from terrella.core.policy import Random
 from terrella.data import record
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 from terrella.sim.replay import ReplayWorld
 
 FRAMES = 5
@@ -27,7 +27,7 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def cartpole():
-    return GymnasiumWorld("CartPole-v1", rgb=False)
+    return GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False))
 
 
 @pytest.fixture
@@ -222,8 +222,8 @@ def test_it_draws_what_the_world_shows(film, cartpole):
 
 def test_a_time_limit_is_kept_and_is_no_termination(cartpole):
     assert as_env(cartpole).max_steps == 500 and as_env(cartpole, max_steps=math.inf).max_steps == math.inf
-    car = GymnasiumWorld("MountainCar-v0", rgb=False)
-    own = GymnasiumWorld(lambda: gymnasium.make("MountainCar-v0", max_episode_steps=200), rgb=False)
+    car = GymnasiumWorld("MountainCar-v0", GymnasiumConfig(rgb=False))
+    own = GymnasiumWorld(lambda: gymnasium.make("MountainCar-v0", max_episode_steps=200), GymnasiumConfig(rgb=False))
     for env in (as_env(car, 2), as_env(own, 2, max_steps=math.inf)):
         env.reset(seed=0)
         ends = [tuple(int(flag.sum()) for flag in env.step(np.array([1, 1]))[2:4]) for _ in range(200)]
@@ -231,7 +231,7 @@ def test_a_time_limit_is_kept_and_is_no_termination(cartpole):
 
 
 def test_a_world_that_cannot_fork_is_one_environment():
-    world = GymnasiumWorld("CartPole-v1", rgb=False, forkable=False)
+    world = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False, forkable=False))
     env = as_env(world, max_steps=30)
     env.reset(seed=0)
     ends = sum(int((end := env.step(np.array([step % 2])))[2][0] or end[3][0]) for step in range(100))

@@ -8,14 +8,14 @@ import torch
 from terrella.core import make_rng, rollout
 from terrella.core.errors import ChannelError
 from terrella.core.policy import Idle, Reactive
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 
 CHANNELS = ("observation", "reward", "done")
 
 
 @pytest.fixture(scope="module")
 def pendulum():
-    return GymnasiumWorld("Pendulum-v1", rgb=False)
+    return GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False))
 
 
 def test_given_actions_lead_from_each_observation_to_the_next(pendulum):

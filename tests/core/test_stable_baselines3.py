@@ -9,7 +9,7 @@ from gymnasium import spaces
 import terrella
 from terrella import library
 from terrella.core.errors import TerrellaError
-from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.sim.gymnasium import GymnasiumConfig, GymnasiumWorld
 from terrella.sim.replay import ReplayWorld
 
 sb3 = pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is missing: pip install 'terrella[sb3]'")
@@ -52,18 +52,18 @@ def test_its_algorithms_and_wrappers_run(film):
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
     short = {"n_steps": 8, "batch_size": 16, "n_epochs": 1, "device": "cpu", "seed": 0}
-    cart = VecNormalize(VecMonitor(terrella.as_sb3(GymnasiumWorld("CartPole-v1", rgb=False), 4)))
+    cart = VecNormalize(VecMonitor(terrella.as_sb3(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), 4)))
     sb3.PPO("MlpPolicy", cart, **short).learn(64)
     sb3.PPO("CnnPolicy", terrella.as_sb3(film, 2), **short).learn(16)
     model = sb3.PPO("MultiInputPolicy", terrella.as_sb3(film, 2, observation=("rgb", "health")), **short).learn(16)
     mean, _ = evaluate_policy(model, VecMonitor(terrella.as_sb3(film, 2, observation=("rgb", "health"))), 4)
     assert mean == 1 + 2 + 3 + 4
-    pendulum = terrella.as_sb3(GymnasiumWorld("Pendulum-v1", rgb=False), 2)
+    pendulum = terrella.as_sb3(GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False)), 2)
     sb3.SAC("MlpPolicy", pendulum, learning_starts=4, batch_size=4, device="cpu").learn(12)
 
 
 def test_the_seed_tells_the_story(film):
-    env = terrella.as_sb3(GymnasiumWorld("CartPole-v1", rgb=False), 2)
+    env = terrella.as_sb3(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), 2)
     env.seed(3)
     first = env.reset()
     assert not np.array_equal(first, env.reset())

@@ -106,7 +106,7 @@ def test_marks_outlive_it(tmp_path):
 def test_a_mark_that_cannot_be_kept_is_not_shown(tmp_path):
     (tmp_path / "file").write_text("in the way")
     browse = Browse(source_of(), tmp_path / "file" / MARKS)
-    with pytest.raises(DatasetError, match="cannot be kept"):
+    with pytest.raises(DatasetError, match="cannot be saved"):
         browse.mark(0, True)
     assert browse.marks() == []
 
@@ -172,7 +172,7 @@ def test_what_is_not_there_is_a_sentence(tmp_path):
 def test_uneven_vectors_are_a_sentence(tmp_path):
     uneven = {STATE: Readings(np.arange(2.0), [np.zeros(2), np.zeros(3)])}
     browse = Browse(source_of(1, lambda n: take_of(n, **uneven)), tmp_path / MARKS)
-    with pytest.raises(DatasetError, match="does not decode"):
+    with pytest.raises(DatasetError, match="cannot be decoded"):
         browse.series(0, STATE)
 
 

@@ -149,7 +149,7 @@ def test_what_cannot_be_rows_is_said_and_the_rest_is_kept(tmp_path):
     assert any("15x16" in note for note in write_source(odd, tmp_path / "odd"))
     same(odd, open_source(tmp_path / "odd"))
     cloud = some(8, (4,), [Sensor("observation.points.lidar", "points", (0, 3))])
-    with pytest.raises(DatasetError, match="nothing but points"):
+    with pytest.raises(DatasetError, match="only points"):
         write_source(cloud, tmp_path / "cloud")
     with pytest.raises(DatasetError, match="not empty"):
         write_source(bad, tmp_path / "set")

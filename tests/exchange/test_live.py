@@ -302,7 +302,7 @@ def test_only_foxglove_and_this_machine_may_watch():
 
 
 def test_a_slow_watcher_holds_up_nobody(monkeypatch):
-    monkeypatch.setattr("terrella.exchange.live_server._BEHIND_BYTES", 2**18)
+    monkeypatch.setattr("terrella.exchange.live_server._BACKLOG_BYTES", 2**18)
     sensor = Sensor("observation.images.big", "image", (256, 256, 3), "uint8")
     noise = np.random.default_rng(0).integers(0, 255, sensor.shape, np.uint8)
     with Live("0", {sensor.name: sensor}, "run") as live:
@@ -318,7 +318,7 @@ def test_a_slow_watcher_holds_up_nobody(monkeypatch):
 
 
 def test_what_never_finishes_its_handshake_is_let_go(monkeypatch):
-    monkeypatch.setattr("terrella.exchange.live_server._HEAD_S", 0.3)
+    monkeypatch.setattr("terrella.exchange.live_server._HEAD_TIMEOUT_S", 0.3)
     with Live("0", SENSORS, "run") as live:
         idle = [socket.create_connection(("127.0.0.1", live.port or 0)) for _ in range(20)]
         endless = socket.create_connection(("127.0.0.1", live.port or 0))

@@ -72,7 +72,7 @@ def test_what_has_no_name_is_nobody_elses():
     mapping = propose(sources)
     assert goes(mapping, "A") == goes(mapping, "C") == ["a.state_0", "a.state_1"]
     assert goes(mapping, "B") == ["b.state_0", "b.state_1"] and mapping.embodiments == ("a", "b")
-    assert all(".state_0, " in source.notes[0] and "without a name" in source.notes[0] for source in mapping.sources)
+    assert all(".state_0, " in source.notes[0] and "no name in" in source.notes[0] for source in mapping.sources)
 
 
 def test_frames_and_quantities_are_never_mixed():
@@ -113,7 +113,7 @@ def test_rates_and_sizes():
     small, big = arm("a", fps=10, size=(8, 12)), arm("b", fps=30, size=(48, 64))
     mapping = propose({"A": big, "B": small})
     assert mapping.rows.fps == 10 and mapping.cameras["observation.images.front"] == MergedCamera("image", 8, 12)
-    assert any("fitted from 48 x 64 into 8 x 12" in note for note in mapping.sources[0].notes)
+    assert any("scaled from 48 x 64 to 8 x 12" in note for note in mapping.sources[0].notes)
     assert propose({"A": big, "B": small}, fps=20).rows.fps == 20
     assert propose({"A": rover()}).rows.fps == 10  # its camera's
     silent = replace(rover(), sensors={"action": vector("action", ["go"])})
@@ -122,7 +122,7 @@ def test_rates_and_sizes():
     assert propose({"A": slow}, fps=10).rows.max_gap_s == 6
     with pytest.raises(DatasetError, match="give the fps"):
         propose({"A": robot("r", [vector("action", ["go"])], [], fps=None)})
-    with pytest.raises(DatasetError, match="nothing to merge"):
+    with pytest.raises(DatasetError, match="no recordings are given"):
         propose({})
 
 
@@ -319,7 +319,7 @@ def test_the_file_is_read_back_and_explains_itself(tmp_path):
         ),
         ('"next.done" = "next.done"', '"next.done" = "next.reward"', "both fill 'next.reward'"),
         ('"next.done" = "next.done"', '"next.done" = "action_mask"', "'action_mask' cannot name a kept sensor"),
-        ('"next.done" = "next.done"', '"next.done" = "observation.done"', "begin both with 'next.'"),
+        ('"next.done" = "next.done"', '"next.done" = "observation.done"', "begin both or neither with 'next.'"),
         ('"next.done" = "next.done"', '"next.done" = 7', "= 7 should be of type str"),
         (
             '"next.done" = "next.done"',
@@ -328,7 +328,7 @@ def test_the_file_is_read_back_and_explains_itself(tmp_path):
         ),
         ('"next.done" = "next.done"', '"observation.images.front" = "observation.whole"', "under cameras and keep"),
         ("numbers = [", "numbers = 3\n_ = [", r"unknown key '_'|numbers = 3 should be of type list"),
-        ('path = "A"', 'path = "Z"', "has the path 'Z'; given were A, B"),
+        ('path = "A"', 'path = "Z"', "has the path 'Z'; the given sources are A, B"),
     ],
 )
 def test_every_slip_is_named(tmp_path, old, new, said):
@@ -355,7 +355,7 @@ def test_no_damage_to_the_file_is_more_than_an_error(tmp_path_factory, data):
 
 
 def test_files_that_are_none(tmp_path):
-    with pytest.raises(DatasetError, match="no mapping to read"):
+    with pytest.raises(DatasetError, match="cannot be read"):
         read_mapping(tmp_path / "none.toml")
     for text, said in (
         (b"", "no \\[\\[source\\]\\]|lacks 'fps'"),

@@ -313,7 +313,7 @@ def test_points_of_every_type_are_read(tmp_path):
     assert source.sensors["observation.points.points"].names == kinds.names
     assert np.array_equal(values[0], np.arange(5)[:, None] + np.arange(8)) and values[0].dtype == np.float32
     assert values[1].shape == (0, 8) and any("all digits of '<f8'" in note for note in source.notes)
-    with pytest.raises(DatasetError, match="Message 2 of '/points'.*no points"):
+    with pytest.raises(DatasetError, match="Message 2 of '/points'.*do not hold points"):
         values[2]
 
 

@@ -335,7 +335,7 @@ def test_reading_anew_counts_anew_and_stopping_is_seen():
     report = MergeReport()
     source = merge({"A": arm()}, propose({"A": arm()}), report)
     next(iter(source.takes()))
-    assert not report.complete and "not complete" in report.text() and report.embodiments()[0]["rows"] == 6
+    assert not report.complete and "incomplete" in report.text() and report.embodiments()[0]["rows"] == 6
     for _ in range(2):
         list(source.takes())
         assert report.complete and report.embodiments()[0]["rows"] == 15
@@ -391,7 +391,7 @@ def test_broken_recordings_are_named_by_source_and_take():
         with pytest.raises(DatasetError, match=f"take 1 of A: .*{said}"):
             list(merge(broken(name, time_s, values), mapping).takes())
     pictures = merge(broken("observation.images.front", [0], [np.zeros((4, 4), np.uint8)]), mapping)
-    with pytest.raises(DatasetError, match="which is no image"):
+    with pytest.raises(DatasetError, match="not image"):
         stack(list(pictures.takes())[1], "observation.images.front")
     with pytest.raises(DatasetError, match="has the path 'A'"):
         merge({"B": arm()}, mapping)
@@ -504,7 +504,7 @@ def test_it_becomes_a_recording(tmp_path):
                 found = np.asarray(new.readings[name].values)
                 np.testing.assert_array_equal(found[: len(truth)], truth)
                 assert not found[len(truth) :].any()
-    with pytest.raises(DatasetError, match="all.toml is there already"):
+    with pytest.raises(DatasetError, match="all.toml exists already"):
         merge_into(sources, tmp_path / "all")
     with pytest.raises(DatasetError, match="not empty"):
         merge_into(sources, tmp_path / "all", tmp_path / "all.toml")
@@ -528,7 +528,7 @@ def test_rewards_between_rows_and_takes_of_one_row():
     _, (take,) = merged_takes({"A": robot("r", [state, reward], [single, late])}, report=report)
     assert stack(take, "next.reward")[:, 0].tolist() == [5]
     assert stack(take, "next.reward_mask")[:, 0].tolist() == [True, False, False, False]
-    assert report.sources["A"].skipped == ["take 0: what is mapped of it makes fewer than two rows"]
+    assert report.sources["A"].skipped == ["take 0: its mapped sensors give fewer than two rows"]
 
 
 def test_text_cannot_be_kept():

@@ -172,11 +172,11 @@ def test_what_opens_is_marked_and_its_depth_changes():
     look = (128.0, 0.0, 41.0, 0.0, CAMERA, (24, 32), 2000.0)
     depth, sector = walls.depth(*look)
     assert (
-        depth[11, 16] == pytest.approx(128) and sector[11, 16] == 1 and walls.moved().tolist() == [False, True, False]
+        depth[11, 16] == pytest.approx(128) and sector[11, 16] == 1 and walls.dynamic().tolist() == [False, True, False]
     )
     walls.update([began[0], room(256, 288, 0, 128), began[2]])
     depth, _ = walls.depth(*look)
-    assert depth[11, 16] > 350 and walls.moved().tolist() == [False, True, False]
+    assert depth[11, 16] > 350 and walls.dynamic().tolist() == [False, True, False]
 
 
 class FakeLine:

@@ -16,7 +16,7 @@ from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
 from terrella.core.spec import POSE, POSE_UNIT
 from terrella.sim.environment_loading import follow
-from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
+from terrella.sim.gymnasium import Adapter, Channel, GymnasiumConfig, GymnasiumWorld
 
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
 
@@ -31,7 +31,7 @@ def plain_env(name: str, world_seed: int) -> gymnasium.Env:
 @pytest.mark.parametrize("name", COPYABLE)
 def test_a_branch_reproduces_the_environments_own_trajectory(name, tmp_path):
     """While other stories move in between, while the state is saved and loaded: every number as in the plain environment."""
-    world, env = GymnasiumWorld(name, rgb=False), plain_env(name, 5)
+    world, env = GymnasiumWorld(name, GymnasiumConfig(rgb=False)), plain_env(name, 5)
     state, rng = world.start(1, make_rng(5)), make_rng(0)
     stranger = world.start(2, rng)
     ended = False
@@ -53,7 +53,7 @@ def test_a_branch_reproduces_the_environments_own_trajectory(name, tmp_path):
 
 @pytest.mark.parametrize("name", COPYABLE)
 def test_a_batch_is_its_entries_side_by_side(name):
-    world, rng = GymnasiumWorld(name, rgb=False), make_rng(1)
+    world, rng = GymnasiumWorld(name, GymnasiumConfig(rgb=False)), make_rng(1)
     together = world.start(3, rng)
     apart = [together.at(entry) for entry in range(3)]
     for _ in range(10):
@@ -65,7 +65,7 @@ def test_a_batch_is_its_entries_side_by_side(name):
 
 def test_an_action_is_held_for_so_many_steps_of_the_environment():
     world, env = terrella.load("gym:CartPole-v1@3", rgb=False), plain_env("CartPole-v1", 5)
-    once = GymnasiumWorld("CartPole-v1", rgb=False).spec
+    once = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)).spec
     assert world.spec.name == "gym:CartPole-v1@3" and world.spec.dt_s == pytest.approx(3 * once.dt_s)
     assert (once.max_episode_steps, world.spec.max_episode_steps) == (500, 167)
     state, rng = world.start(1, make_rng(5)), make_rng(0)
@@ -82,7 +82,7 @@ def test_an_action_is_held_for_so_many_steps_of_the_environment():
 
 
 def test_episodes_in_processes_hold_their_actions_too():
-    world = GymnasiumWorld("CartPole-v1", rgb=False, forkable=False, repeat=2)
+    world = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False, forkable=False, repeat=2))
     try:
         state = world.imagine(world.start(2, make_rng(0)), torch.tensor([0, 1]), make_rng(0))
         assert world.render(state, ("reward",))["reward"].tolist() == [2.0, 2.0]
@@ -97,7 +97,10 @@ def test_an_action_that_is_held_for_no_or_endless_steps_is_refused(count):
 
 
 def test_a_state_goes_on_in_another_instance(tmp_path):
-    first, second = GymnasiumWorld("MountainCar-v0", rgb=False), GymnasiumWorld("MountainCar-v0", rgb=False)
+    first, second = (
+        GymnasiumWorld("MountainCar-v0", GymnasiumConfig(rgb=False)),
+        GymnasiumWorld("MountainCar-v0", GymnasiumConfig(rgb=False)),
+    )
     action = torch.tensor([2])
     state = first.imagine(first.start(1, make_rng(0)), action, make_rng(1))
     state.save(tmp_path / "state")
@@ -108,7 +111,7 @@ def test_a_state_goes_on_in_another_instance(tmp_path):
 
 def test_dice_fall_from_the_rng_and_not_from_the_state():
     """A slippery lake: a planner may not foresee its dice, but the same rng throws them alike."""
-    world = GymnasiumWorld("FrozenLake-v1", rgb=False)
+    world = GymnasiumWorld("FrozenLake-v1", GymnasiumConfig(rgb=False))
     states = world.start(1, make_rng(0)).fork(200)
     actions = torch.full((200,), 2)
     once, again = world.imagine(states, actions, make_rng(1)), world.imagine(states, actions, make_rng(1))
@@ -119,7 +122,7 @@ def test_dice_fall_from_the_rng_and_not_from_the_state():
 
 
 def test_after_done_the_world_stands_still_without_reward():
-    world, rng = GymnasiumWorld("CartPole-v1", rgb=False), make_rng(0)
+    world, rng = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), make_rng(0)
     state = world.start(2, rng)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # Gymnasium warns whoever steps a finished environment
@@ -135,13 +138,13 @@ def test_after_done_the_world_stands_still_without_reward():
 
 
 def test_the_time_limit_is_left_to_the_training():
-    world, rng = GymnasiumWorld("MountainCar-v0", rgb=False), make_rng(0)
+    world, rng = GymnasiumWorld("MountainCar-v0", GymnasiumConfig(rgb=False)), make_rng(0)
     assert world.spec.max_episode_steps == 200
     state = world.start(1, rng)
     for _ in range(220):
         state = world.imagine(state, torch.tensor([1]), rng)
     assert not state["done"]
-    limited = GymnasiumWorld("MountainCar-v0", rgb=False, max_episode_steps=3)
+    limited = GymnasiumWorld("MountainCar-v0", GymnasiumConfig(rgb=False, options={"max_episode_steps": 3}))
     assert limited.spec.forkable
     state = limited.start(1, rng)
     dones = [bool((state := limited.imagine(state, torch.tensor([1]), rng))["done"]) for _ in range(4)]
@@ -245,7 +248,7 @@ def test_what_cannot_be_copied_exactly_gives_tickets(make):
         with pytest.raises(StaleStateError, match="cannot go back"):
             verb()
     with pytest.raises(TerrellaError, match="cannot be copied"):
-        GymnasiumWorld(make, forkable=True)
+        GymnasiumWorld(make, GymnasiumConfig(forkable=True))
 
 
 def test_what_the_trial_did_not_see_is_still_never_copied_by_halves():
@@ -311,11 +314,11 @@ def test_every_kind_of_action_arrives_as_its_space_says(action):
 
 
 def test_what_it_says_of_itself():
-    spec = GymnasiumWorld("CartPole-v1", rgb=False).spec
+    spec = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)).spec
     assert (spec.dt_s, spec.name, spec.forkable, spec.max_batch) == (0.02, "gym:CartPole-v1", True, None)
     assert spec.keys == {"ArrowLeft": [0.0], "ArrowRight": [1.0]} and "rgb" not in spec.channels
-    assert GymnasiumWorld("Pendulum-v1", rgb=False).spec.dt_s == 0.05
-    assert GymnasiumWorld("Pendulum-v1", rgb=False, dt_s=0.1).spec.dt_s == 0.1
+    assert GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False)).spec.dt_s == 0.05
+    assert GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False, dt_s=0.1)).spec.dt_s == 0.1
 
 
 @pytest.mark.parametrize("extra", ["box2d", "mujoco"])
@@ -333,10 +336,10 @@ def test_bad_requests_are_answered_in_one_sentence():
         with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
             GymnasiumWorld(name)
     with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
-        GymnasiumWorld("CartPole-v1", no_such_option=1)
+        GymnasiumWorld("CartPole-v1", GymnasiumConfig(options={"no_such_option": 1}))
     with pytest.raises(TerrellaError, match="FlattenObservation"):
-        GymnasiumWorld("Blackjack-v1", rgb=False)
-    world, rng = GymnasiumWorld("CartPole-v1", rgb=False), make_rng(0)
+        GymnasiumWorld("Blackjack-v1", GymnasiumConfig(rgb=False))
+    world, rng = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), make_rng(0)
     state = world.start(1, rng)
     with pytest.raises(ActionError):
         world.imagine(state, torch.tensor([2]), rng)
@@ -371,7 +374,7 @@ class Painter(gymnasium.Env):
 
 
 def test_a_pictured_observation_is_the_picture_made_small_and_info_gives_channels():
-    world, rng = GymnasiumWorld(Painter, size=(4, 6), info_channels=("laps",)), make_rng(0)
+    world, rng = GymnasiumWorld(Painter, GymnasiumConfig(size=(4, 6), info_channels=("laps",))), make_rng(0)
     assert set(world.spec.channels) == {"rgb", "reward", "done", "laps"} and world.spec.forkable
     state = world.start(2, rng)
     gas, nothing = [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]
@@ -381,7 +384,7 @@ def test_a_pictured_observation_is_the_picture_made_small_and_info_gives_channel
     assert seen["laps"].tolist() == [4.0, 0.0]
     assert (seen["rgb"][0] == 20).all(), "the mean of four pixels, one of them 80"
     assert (seen["rgb"][1] == 0).all() and seen["rgb"].shape == (2, 4, 6, 3)
-    assert "rgb" not in GymnasiumWorld(Painter, rgb=False).spec.channels
+    assert "rgb" not in GymnasiumWorld(Painter, GymnasiumConfig(rgb=False)).spec.channels
 
 
 def test_arrow_keys_steer_give_gas_and_brake():
@@ -449,7 +452,7 @@ def test_an_adapter_names_depth_pose_cameras_and_what_actions_mean():
 
 def test_a_channel_of_another_shape_than_it_declares_is_refused_by_name():
     wrong = Adapter(channels={"depth": Channel(lambda env: np.zeros(3), spaces.Box(0, 1, (2,), np.float32))})
-    world = GymnasiumWorld(Turntable, adapter=wrong)
+    world = GymnasiumWorld(Turntable, GymnasiumConfig(adapter=wrong))
     with pytest.raises(TerrellaError, match="gave 'depth' of shape"):
         world.render(world.start(1, make_rng(0)), ("depth",))
 

@@ -22,7 +22,7 @@ if find_spec("mujoco") is None:
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import robot_of
 from terrella.sim.mujoco_tasks import Hold, Reach, Stepping, VelocityTracking
-from terrella.sim.mujoco_world import MujocoWorld
+from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
  <light pos="0 0 3"/><geom name="ground" type="plane" size="2 2 .1"/>
@@ -218,7 +218,7 @@ def test_what_cannot_be_dumped_does_not_stop_the_others(tmp_path):
     world, rng = load("mujoco:ant", cameras=(), dumps=tmp_path / "file"), make_rng(0)
     state = world.start(2, rng)
     physics = state["physics"].clone()
-    physics[0, world.body.qvel] = 1e9
+    physics[0, world.layout.qvel] = 1e9
     with pytest.warns(RuntimeWarning, match="could not be saved"):
         after = world.imagine(state.replace(physics=physics), torch.zeros(2, 8), rng)
     assert after["done"].tolist() == [True, False]
@@ -375,11 +375,11 @@ SOLES = "".join(
 def test_legs_are_paid_for_taking_turns_by_a_clock_that_is_seen(tmp_path):
     (tmp_path / "blind.xml").write_text(BIPED % "")
     with pytest.raises(TerrellaError, match="lacks: foot_left_foot, place_left_foot"):
-        MujocoWorld(str(tmp_path / "blind.xml"), task=Stepping(), cameras=())
+        MujocoWorld(str(tmp_path / "blind.xml"), MujocoConfig(task=Stepping(), cameras=()))
     (tmp_path / "biped.xml").write_text(BIPED % SOLES)
     task = Stepping(forward=(0.0, 0.0), turning=(0.0, 0.0), noise=0.0, straight=())
-    world = MujocoWorld(str(tmp_path / "biped.xml"), task=task, cameras=())
-    plain = MujocoWorld(str(tmp_path / "biped.xml"), task=VelocityTracking(), cameras=())
+    world = MujocoWorld(str(tmp_path / "biped.xml"), MujocoConfig(task=task, cameras=()))
+    plain = MujocoWorld(str(tmp_path / "biped.xml"), MujocoConfig(task=VelocityTracking(), cameras=()))
     clock = world.spec.channels["observation"].shape[0] - plain.spec.channels["observation"].shape[0]
     state, rng, paid = world.start(3, make_rng(0)), make_rng(0), torch.zeros(3)
     moves = torch.tensor(
@@ -411,12 +411,12 @@ def test_hinges_that_are_held_stay_as_they_are_at_rest():
 
 
 def test_a_reaching_arm_sees_its_own_joints_and_nothing_that_lies_about(arm):
-    world = MujocoWorld(str(arm), task=Reach(hand="tip"), cameras=())
+    world = MujocoWorld(str(arm), MujocoConfig(task=Reach(hand="tip"), cameras=()))
     assert world.spec.channels["observation"].shape == (8,)  # a joint, its speed, the goal, what is left to it
     state = world.start(2, make_rng(0))
     moved = state["physics"].clone()
     moved[1] = moved[0]
-    moved[1, world.body.qpos][1:4] += 0.3  # the ball
+    moved[1, world.layout.qpos][1:4] += 0.3  # the ball
     state = state.replace(
         physics=moved, goal=state["goal"][:1].expand(2, 3), sensors=state["sensors"][:1].expand(2, -1)
     )

@@ -14,7 +14,7 @@ from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
 from terrella.core.spec import neutral_action
 from terrella.library import load, load_adapter
-from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
+from terrella.sim.gymnasium import Adapter, Channel, GymnasiumConfig, GymnasiumWorld
 
 
 class Toy(gymnasium.Env):
@@ -67,7 +67,7 @@ def test_names_keys_rest_and_clock_are_the_environments_own():
     assert enum.action_names == ("turn_left", "turn_right", "stay") and enum.dt_s == 0.04
     assert enum.keys["ArrowLeft"] == [0] and enum.keys["ArrowRight"] == [1] and neutral_action(enum) == 2
     assert tables.keys == {"KeyI": [1], "KeyK": [2]} and tables.card["how"]["keys"] == "get_keys_to_action"
-    assert nothing.action_names == () and nothing.card["how"]["action names"] == "none told"
+    assert nothing.action_names == () and nothing.card["how"]["action names"] == "none"
 
 
 def test_pictures_of_any_form_and_the_parts_of_a_dictionary_are_seen():
@@ -94,7 +94,7 @@ def test_channels_are_read_off_info_and_attributes(tmp_path):
         "adapter = Adapter(channels={'depth': Channel('info.depth', unit='m'), 'pose': Channel('info.body.pose'),\n"
         "                            'age': Channel('unwrapped.steps')}, action_names=('a', 'b', 'c'), idle=(1,))\n"
     )
-    world, rng = GymnasiumWorld(Toy, adapter=load_adapter(f"{tmp_path}/mine.py")), make_rng(0)
+    world, rng = GymnasiumWorld(Toy, GymnasiumConfig(adapter=load_adapter(f"{tmp_path}/mine.py"))), make_rng(0)
     state = world.start(2, rng)
     state = world.imagine(world.imagine(state, torch.tensor([0, 0]), rng), torch.tensor([0, 0]), rng)
     seen = world.render(state, ("depth", "pose", "age"))
@@ -103,7 +103,7 @@ def test_channels_are_read_off_info_and_attributes(tmp_path):
     with pytest.raises(
         TerrellaError, match="'depth' of .* cannot be read: there is no 'info.range': the keys are depth, body"
     ):
-        GymnasiumWorld(Toy, adapter=Adapter({"depth": Channel("info.range")}))
+        GymnasiumWorld(Toy, GymnasiumConfig(adapter=Adapter({"depth": Channel("info.range")})))
     with pytest.raises(TerrellaError, match="has no 'other'"):
         load_adapter(f"{tmp_path}/mine.py:other")
 
@@ -187,6 +187,6 @@ def test_pictures_that_change_their_size_are_refused_unless_one_size_is_given():
     state = world.imagine(world.start(1, rng), torch.tensor([0]), rng)
     with pytest.raises(TerrellaError, match="change their size, from 16x16 to 17x16; .*--size 64 64"):
         world.render(state, ("rgb",))
-    world = GymnasiumWorld(Growing, size=(8, 8))
+    world = GymnasiumWorld(Growing, GymnasiumConfig(size=(8, 8)))
     state = world.imagine(world.start(1, rng), torch.tensor([0]), rng)
     assert world.render(state, ("rgb",))["rgb"].shape == (1, 8, 8, 3)

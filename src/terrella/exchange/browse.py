@@ -1,4 +1,4 @@
-"""Browse: a recording of any format, opened for looking at: its list of episodes, single readings, and marks of bad ones."""
+"""Browse: a recording of any format, opened for viewing: its episodes, single readings, and marks of bad episodes."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from .convert import open_source, write_source
 from .poses import pose_columns
 
 MARKS = ".terrella-marks.json"  # in the folder of the recording
-_OPEN = 2  # takes kept open at once
+_MAX_OPEN = 2  # takes kept open at once
 _MARKS_VERSION = 1
-_SEE = "look for the cause with `terrella data doctor`"
+_HINT = "look for the cause with `terrella data doctor`"
 _FORMS = {
     "image": "a picture, uint8 [H, W, 3]",
     "depth": "depth in metres, [h, w]",
@@ -32,21 +32,16 @@ _FORMS = {
 }
 
 Progress = Callable[[int, int], None]  # (episodes done, episodes in all)
-Export = Callable[[Path, Sequence[int], Progress], Sequence[str] | None]  # gives notes on what was left out
+Export = Callable[[Path, Sequence[int], Progress], Sequence[str] | None]  # returns notes on what was left out
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One line of the list of episodes.
+    """One line of the list of episodes."""
 
-    rows:    readings of its first camera (where it has none: of its first sensor).
-    seconds: time of its last reading.
-    task:    the instruction, "" where there is none.
-    """
-
-    rows: int
-    seconds: float
-    task: str = ""
+    rows: int  # readings of the first camera, or of the first sensor if there is no camera
+    seconds: float  # time of the last reading
+    task: str = ""  # the instruction, "" for none
 
     @staticmethod
     def of(take: Take) -> EpisodeEntry:
@@ -57,16 +52,15 @@ class EpisodeEntry:
 
 
 class Browse:
-    """Looks into a recording: what `terrella.serve.viewer.Viewable` asks for.
+    """Views a recording; implements `terrella.serve.viewer.Viewable`.
 
-    source:  the recording; where its takes are no sequence, they are walked from the first on.
-    marks:   JSON file that keeps which episodes are bad; it is made when the first is marked.
+    source:  the recording; takes that are not a sequence are read in order from the first.
+    marks:   JSON file of the bad episodes, created with the first mark.
     entries: the list of episodes; without it, every take is opened once to learn its length.
-    export:  writes the episodes of the given numbers into a new folder, and calls `report` as it goes along; returns
-             sentences on what it left out or changed.
+    export:  (path, episodes, report) -> notes on what was left out or changed; writes episodes into a new folder.
 
-    At most two takes are kept open. DatasetError where the marks are unreadable, an episode, sensor or reading does not
-    exist, or one does not decode. Not for several threads at once.
+    At most two takes are kept open. DatasetError where the marks are unreadable, or an episode, sensor or reading does not
+    exist or cannot be decoded. Not thread-safe.
     """
 
     def __init__(
@@ -77,16 +71,16 @@ class Browse:
         export: Export | None = None,
     ):
         self.source, self._marks_path, self._export = source, Path(marks), export
-        self._open = _Walk(source).take
+        self._open = _TakeReader(source).take
         self._texts = {name for name, sensor in source.sensors.items() if sensor.dtype == "string"}
         self.entries = tuple(entries if entries is not None else map(EpisodeEntry.of, source.takes()))
         self._takes: OrderedDict[int, _OpenTake] = OrderedDict()
         self._bad = _read_marks(self._marks_path)
 
-    # -- what there is ------------------------------------------------------------------------------------------------
+    # -- contents -----------------------------------------------------------------------------------------------------
 
     def about(self) -> dict:
-        """The recording as JSON: name, robot, fps, notes, sensors (in the order in which a page shows them)."""
+        """The recording as JSON: name, robot, fps, notes, sensors (in display order)."""
         source = self.source
         return {
             "name": source.name,
@@ -102,10 +96,10 @@ class Browse:
         return [{"rows": entry.rows, "seconds": _finite(entry.seconds), "task": entry.task} for entry in self.entries]
 
     def episode(self, number: int) -> dict:
-        """One episode as JSON: seconds, task, start_ns (text: it is too long for a JSON number in a browser), language
-        ([[time_s, text], ...]: the instruction as it changes, and what sensors of text say) and per sensor count and fault.
+        """One episode as JSON: seconds, task, start_ns (as text, too long for a JSON number in a browser), language
+        ([[time_s, text], ...]: changes of the instruction, and the values of text sensors), and each sensor's count and fault.
 
-        A fault is a sentence that says why a sensor cannot be shown; "" where it can.
+        A fault says why a sensor cannot be shown; "" if it can.
         """
         opened = self._take(number)
         sensors, ends = {}, [0.0]
@@ -133,7 +127,7 @@ class Browse:
     # -- readings -----------------------------------------------------------------------------------------------------
 
     def times(self, number: int, sensor: str) -> np.ndarray:
-        """float64 [n], ascending, seconds since the episode began."""
+        """float64 [n], ascending, seconds since the start of the episode."""
         return self._take(number).times(sensor)
 
     def reading(self, number: int, sensor: str, index: int) -> np.ndarray:
@@ -141,34 +135,34 @@ class Browse:
         return self._take(number).reading(sensor, index)
 
     def series(self, number: int, sensor: str) -> np.ndarray:
-        """A vector sensor's whole episode, float64 [n, k]."""
+        """All values of a vector sensor, float64 [n, k]."""
         return self._take(number).series(sensor)
 
     # -- marks and export ---------------------------------------------------------------------------------------------
 
     def marks(self) -> list[int]:
-        """Numbers of the episodes marked bad, ascending."""
+        """Numbers of the episodes that are marked bad, ascending."""
         return sorted(number for number in self._bad if number < len(self.entries))
 
     def mark(self, number: int, bad: bool) -> None:
-        """Marks an episode bad, or good again; it is on the disk when this returns."""
+        """Marks an episode bad, or good again, and saves the mark."""
         self._check(number)
         marked = self._bad | {number} if bad else self._bad - {number}
         try:
             write_json(self._marks_path, {"version": _MARKS_VERSION, "bad": sorted(marked)})
         except OSError as error:
             raise DatasetError(
-                f"the mark cannot be kept in {self._marks_path} ({error.strerror}); make that folder writable, or view a copy."
+                f"the mark cannot be saved in {self._marks_path} ({error.strerror}); make that folder writable, or view a copy."
             ) from error
         self._bad = marked
 
     def export(self, path: Path, keep: Sequence[int], report: Progress) -> tuple[int, list[str]]:
-        """Writes the episodes `keep` into a new folder `path`; may run while other methods do, in its own thread.
+        """Writes the episodes `keep` into a new folder `path`; may run in its own thread beside other methods.
 
-        Returns how many episodes the folder has, and sentences on what was left out or changed.
+        Returns the folder's number of episodes, and notes on what was left out or changed.
         """
         if self._export is None:
-            raise DatasetError(f"{self.source.name} was opened for looking only; it cannot be exported from here.")
+            raise DatasetError(f"{self.source.name} was opened without an exporter; open it with browse().")
         for number in keep:
             self._check(number)
         notes = list(self._export(path, list(keep), report) or ())
@@ -197,7 +191,7 @@ class Browse:
     def _take(self, number: int) -> _OpenTake:
         self._check(number)
         if number not in self._takes:
-            while len(self._takes) >= _OPEN:
+            while len(self._takes) >= _MAX_OPEN:
                 self._takes.popitem(last=False)
             self._takes[number] = _OpenTake(self.source, number, self._open(number))
         self._takes.move_to_end(number)
@@ -205,7 +199,7 @@ class Browse:
 
 
 class _OpenTake:
-    """One take, with the checked times and whole vectors that were asked of it so far."""
+    """One take, with a cache of checked times and whole vectors."""
 
     def __init__(self, source: Source, number: int, take: Take):
         self.take, self._source, self._number = take, source, number
@@ -227,17 +221,17 @@ class _OpenTake:
         kind = self._source.sensors[sensor].kind
         flat = value.ndim == 2 and value.dtype.kind in "fiu"
         if kind == "image":
-            good = value.dtype == np.uint8 and value.ndim == 3 and value.shape[2] == 3 and value.size
+            valid = value.dtype == np.uint8 and value.ndim == 3 and value.shape[2] == 3 and value.size
         else:
-            good = kind == "vector" or (flat and (value.shape[1] >= 3 if kind == "points" else value.size))
-        if not good:
-            raise DatasetError(f"{what} is {value.dtype} {list(value.shape)} and not {_FORMS[kind]}; {_SEE}.")
+            valid = kind == "vector" or (flat and (value.shape[1] >= 3 if kind == "points" else value.size))
+        if not valid:
+            raise DatasetError(f"{what} is {value.dtype} {list(value.shape)} and not {_FORMS[kind]}; {_HINT}.")
         return value
 
     def series(self, sensor: str) -> np.ndarray:
         if sensor not in self._series:
             if self._source.sensors[sensor].kind != "vector":
-                raise DatasetError(f"{self._where(sensor)} is no vector; it is shown one reading at a time.")
+                raise DatasetError(f"{self._where(sensor)} is not a vector; read it one reading at a time.")
             times, values = self.times(sensor), self._readings(sensor).values
             with _decoding(self._where(sensor)):
                 whole = np.asarray(values if isinstance(values, np.ndarray) else [np.asarray(v) for v in values])
@@ -245,16 +239,16 @@ class _OpenTake:
         return self._series[sensor]
 
     def texts(self, sensor: str) -> list[list]:
-        """[[time_s, "name: text"], ...] of a sensor of text, where it changes; its fault, where it cannot be read."""
-        label, found = sensor.rpartition(".")[2], []
+        """[[time_s, "name: text"], ...] at the changes of a text sensor; or its fault, where it cannot be read."""
+        label, changes = sensor.rpartition(".")[2], []
         try:
             for time_s, value in zip(self.times(sensor).tolist(), self._readings(sensor).values):
                 text = f"{label}: {np.asarray(value).reshape(-1)[0]}"
-                if not found or found[-1][1] != text:
-                    found.append([time_s, text])
+                if not changes or changes[-1][1] != text:
+                    changes.append([time_s, text])
         except DatasetError as error:
-            found.append([0.0, str(error)])
-        return found
+            changes.append([0.0, str(error)])
+        return changes
 
     def _readings(self, sensor: str) -> Readings:
         if sensor not in self._source.sensors:
@@ -274,12 +268,12 @@ def _decoding(what: str) -> Iterator[None]:
         yield
     except DatasetError:
         raise
-    except Exception as error:  # whatever a decoder makes of a broken file
-        raise DatasetError(f"{what} does not decode ({type(error).__name__}: {error}); {_SEE}.") from error
+    except Exception as error:  # decoders fail in many ways on a broken file
+        raise DatasetError(f"{what} cannot be decoded ({type(error).__name__}: {error}); {_HINT}.") from error
 
 
-class _Walk:
-    """Episodes by number of any source; one that only gives them in turn is walked on from the last, or begun anew."""
+class _TakeReader:
+    """Takes by number. Of a source that only iterates, reading goes on from the last take, or starts again."""
 
     def __init__(self, source: Source):
         self._source = source
@@ -287,10 +281,10 @@ class _Walk:
 
     def take(self, number: int) -> Take:
         if number < self._at or self._at == 0:
-            found = self._source.takes()
-            if isinstance(found, Sequence) and number < len(found):
-                return found[number]
-            self._at, self._takes = 0, iter(found)
+            takes = self._source.takes()
+            if isinstance(takes, Sequence) and number < len(takes):
+                return takes[number]
+            self._at, self._takes = 0, iter(takes)
         for take in self._takes:
             self._at += 1
             if self._at == number + 1:
@@ -321,12 +315,12 @@ def _describe(source: Source, sensor: Sensor) -> dict:
 
 
 def _camera(source: Source, sensor: Sensor) -> dict | None:
-    """What the recorded world says of a camera: intrinsics, size, pose (the channel that it is mounted on) and mount."""
+    """The camera in the recorded world's description: intrinsics, size, pose (the channel it is mounted on) and mount."""
     world = source.facts.get("world")
     cameras = world.get("cameras") if isinstance(world, Mapping) else None
     suffix = sensor.name.removeprefix("observation.images.")
-    found = cameras.get("rgb" if suffix == "rgb" else f"rgb.{suffix}") if isinstance(cameras, Mapping) else None
-    return dict(found) if sensor.kind == "image" and isinstance(found, Mapping) else None
+    camera = cameras.get("rgb" if suffix == "rgb" else f"rgb.{suffix}") if isinstance(cameras, Mapping) else None
+    return dict(camera) if sensor.kind == "image" and isinstance(camera, Mapping) else None
 
 
 def _language(take: Take) -> list[list]:
@@ -350,7 +344,7 @@ def _read_marks(path: Path) -> frozenset[int]:
         kept = json.loads(path.read_text(encoding="utf-8"))
         bad = kept["bad"]
         if kept["version"] != _MARKS_VERSION or not all(type(number) is int and number >= 0 for number in bad):
-            raise ValueError("its list of bad episodes is not one of whole numbers, or of another version")
+            raise ValueError("its version differs, or its list of bad episodes is not one of integers")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(f"the marks in {path} cannot be read ({error}); mend the file, or move it away.") from error
     return frozenset(bad)
@@ -359,14 +353,14 @@ def _read_marks(path: Path) -> frozenset[int]:
 def browse(
     path: str | Path, carry: Callable[[Path, Path, Sequence[int], Progress], Sequence[str]] | None = None
 ) -> Browse:
-    """A recording of any format, to be looked through.
+    """Opens a recording of any format for viewing.
 
-    carry(from, to, episodes, report): writes episodes of a LeRobot folder into a new one bit for bit, for the export;
-    without it they are written anew, as those of other formats are.
+    carry: (from, to, episodes, report) copies episodes of a LeRobot folder bit for bit into a new one, for the export.
+           Without it they are converted, as those of other formats are.
     """
     source, where = open_source(path), Path(path)
     if "://" in str(path):
-        marks = Path(f".{where.name}{MARKS}")  # here: nothing is written to a remote
+        marks = Path(f".{where.name}{MARKS}")  # in the working directory: remotes are not written to
     else:
         marks = where / MARKS if where.is_dir() else where.with_name(f".{where.name}{MARKS}")
 

@@ -1,8 +1,8 @@
-"""A WebSocket server on this machine that the Foxglove app connects to and sees sensors live: Foxglove's own.
+"""A WebSocket server on this machine, Foxglove's own, that the Foxglove app connects to for live sensors.
 
-That server answers whoever connects (measured: foxglove-sdk 0.30 takes any Origin and Host), so every page of the web that
-a browser here has open could watch a robot's cameras. A door stands before it, which lets in the Foxglove app, local pages
-and programs alone; the server itself listens on an address of this machine that nobody knows.
+Foxglove's server accepts every connection (measured: foxglove-sdk 0.30 accepts any Origin and Host), so that any web page in
+a local browser could watch a robot's cameras. A gate in front of it admits only the Foxglove app, local pages and programs;
+the server itself listens on a random loopback address.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ try:
 except ImportError as error:
     raise DatasetError("Foxglove needs packages that are not installed: pip install 'terrella[mcap]'.") from error
 
-_HERE = ("127.0.0.1", "localhost", "::1")
-_WATCHERS = 8
-_BEHIND_BYTES = 2**25  # of readings that may wait for one watcher; one that is slower loses the rest
-_LONGEST_HEAD, _HEAD_S = 2**14, 5.0  # of a handshake: bytes, and seconds until it must have come
+_LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
+_MAX_CLIENTS = 8
+_BACKLOG_BYTES = 2**25  # of readings queued for one client; a slower client loses the rest
+_MAX_HEAD, _HEAD_TIMEOUT_S = 2**14, 5.0  # bytes and seconds of a handshake
 _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class LiveServer:
-    """Serves the sensors' readings until closed. A reading is encoded only when somebody watches its sensor.
+    """Serves the sensors' readings until closed. A reading is encoded only if a client subscribes to its sensor.
 
-    `port` is where watchers connect. DatasetError where it cannot be had.
+    Clients connect to `port`. DatasetError where the port is not available.
     """
 
     def __init__(self, port: int, sensors: Mapping[str, Sensor], name: str):
@@ -56,16 +56,16 @@ class LiveServer:
             if message_encoder.calibration(sensor, 0)
         }
         largest = max((int(np.prod(it.shape)) * np.dtype(it.dtype).itemsize for it in sensors.values()), default=1)
-        self._server = _serve(name, context, min(max(_BEHIND_BYTES // max(largest, 1), 16), 1024))
+        self._server = _serve(name, context, min(max(_BACKLOG_BYTES // max(largest, 1), 16), 1024))
         try:
-            self._door = _Door(port, self._server)
+            self._gate = _Gate(port, self._server)
         except BaseException:
             self._server[0].stop()
             raise
-        self.port = self._door.port
+        self.port = self._gate.port
 
     def add(self, name: str, time_ns: int, value: np.ndarray) -> None:
-        """Sends a reading, and its camera's calibration, to those who watch, without waiting for them."""
+        """Sends a reading, and its camera's calibration, to the subscribed clients, without waiting for them."""
         if self._channels[name].has_sinks():
             self._channels[name].log(self._encoders[name](value, time_ns), log_time=time_ns)
         else:
@@ -75,19 +75,19 @@ class LiveServer:
             self._calibrations[name].log(data, log_time=time_ns)
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Does nothing: readings are sent at once."""
 
     def close(self) -> None:
-        """Says goodbye to all watchers and frees the port."""
+        """Disconnects all clients and frees the port."""
         self._server[0].stop()
-        self._door.close()
+        self._gate.close()
 
     abandon = close
 
 
 def _serve(name: str, context: foxglove.Context, backlog: int) -> tuple[foxglove.websocket.WebSocketServer, str]:
-    """Foxglove's server and its address: one of the 16 million of this machine, where the system has more than one."""
-    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # what watchers do wrong is answered to them
+    """Foxglove's server and its address: a random one of 127.0.0.0/8, where the system has more than 127.0.0.1."""
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # clients get their own error messages
     hidden = ".".join(str(random.SystemRandom().randint(1, 254)) for _ in range(3))
     options = {"name": name, "port": 0, "context": context, "message_backlog_size": backlog}
     for host in (f"127.{hidden}", "127.0.0.1"):  # macOS has only the second
@@ -98,8 +98,8 @@ def _serve(name: str, context: foxglove.Context, backlog: int) -> tuple[foxglove
     raise DatasetError(f"Foxglove's server cannot be started ({failure}).") from failure
 
 
-class _Door:
-    """Hands the connections of those who may watch through to the server, on a thread of its own."""
+class _Gate:
+    """Forwards admitted connections to the server, in its own thread."""
 
     def __init__(self, port: int, server: tuple[foxglove.websocket.WebSocketServer, str]):
         self._inner = server[1], server[0].port
@@ -119,34 +119,34 @@ class _Door:
     def _run(self) -> None:
         try:
             asyncio.run(self._open())
-        except (OSError, OverflowError) as error:  # the port is taken, forbidden or none
+        except (OSError, OverflowError) as error:  # the port is taken, forbidden or invalid
             self._failure = error
         finally:
             self._started.set()
 
     async def _open(self) -> None:
-        server = await asyncio.start_server(self._let_in, "127.0.0.1", self.port, limit=_LONGEST_HEAD)
+        server = await asyncio.start_server(self._admit, "127.0.0.1", self.port, limit=_MAX_HEAD)
         self.port, self._loop = server.sockets[0].getsockname()[1], asyncio.get_running_loop()
         self._started.set()
         await self._stop.wait()
         server.close()  # connections end with the loop
 
-    async def _let_in(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _admit(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._inside += 1
         ends = [writer]
         try:
-            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_S)
-            if self._inside > _WATCHERS or not _welcome(head):
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), _HEAD_TIMEOUT_S)
+            if self._inside > _MAX_CLIENTS or not _is_admitted(head):
                 writer.write(_REFUSED)
                 await writer.drain()
                 return
             from_server, to_server = await asyncio.open_connection(*self._inner)
             ends.append(to_server)
             to_server.write(head)
-            both = [asyncio.ensure_future(_hand_on(*way)) for way in ((reader, to_server), (from_server, writer))]
+            both = [asyncio.ensure_future(_forward(*pair)) for pair in ((reader, to_server), (from_server, writer))]
             await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
-            for way in both:
-                way.cancel()
+            for task in both:
+                task.cancel()
         except (OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, TimeoutError):
             pass
         finally:
@@ -155,7 +155,7 @@ class _Door:
                 end.close()
 
 
-async def _hand_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
     try:
         while data := await reader.read(2**16):
             writer.write(data)
@@ -164,20 +164,22 @@ async def _hand_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -
         pass
 
 
-def _welcome(head: bytes) -> bool:
-    """Whether a handshake comes from Foxglove, a local page or a program; a browser names the page that asks."""
+def _is_admitted(head: bytes) -> bool:
+    """Whether a handshake comes from Foxglove, a local page or a program. Browsers send the page's Origin."""
     try:
         headers = parse_headers(io.BytesIO(head.partition(b"\r\n")[2]))
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
-        return len(hosts) == 1 and urlsplit(f"//{hosts[0]}").hostname in _HERE and all(map(_known, origins))
+        return len(hosts) == 1 and urlsplit(f"//{hosts[0]}").hostname in _LOCAL_HOSTS and all(map(_is_trusted, origins))
     except (ValueError, HTTPException):
         return False
 
 
-def _known(origin: str) -> bool:
-    """The Foxglove app, on the web or installed (no web page has a scheme like its own), and local pages."""
+def _is_trusted(origin: str) -> bool:
+    """Whether an Origin is the Foxglove app, on the web or installed (with its own scheme), or a local page."""
     parts = urlsplit(origin)
     if parts.scheme in ("http", "https"):
         host = parts.hostname or ""
-        return host in _HERE or (parts.scheme == "https" and (host == "foxglove.dev" or host.endswith(".foxglove.dev")))
+        return host in _LOCAL_HOSTS or (
+            parts.scheme == "https" and (host == "foxglove.dev" or host.endswith(".foxglove.dev"))
+        )
     return parts.scheme != ""

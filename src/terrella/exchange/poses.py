@@ -1,4 +1,4 @@
-"""Which numbers of a vector are a pose on the ground, found by their names."""
+"""Finds the numbers of a vector that are a pose on the ground."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _TURN = "(?:q|quat|quaternion|rotation|orientation)"
 
 
 def pose_columns(sensor: Sensor) -> dict | None:
-    """Which numbers of a vector are a pose on the ground, found by their names: {"x", "y", "quaternion": [w, x, y, z] or
-    None, "yaw": column or None, "degrees"}. None where it holds no position in metres.
+    """The columns of a pose on the ground, found by the numbers' names: {"x", "y", "quaternion": [w, x, y, z] or None,
+    "yaw": column or None, "degrees": whether yaw is in degrees}. None where there is no position in metres.
 
-    The world's z is up, and a body looks along its own x. Quaternions and yaw turn the body's axes into the world's.
+    The world's z is up, and a body looks along its own x. Quaternions and yaw rotate body axes into world axes.
     """
     if not sensor.dtype.startswith("float"):
         return None

@@ -1,4 +1,4 @@
-"""Atari games (ale-py) as Gymnasium environments that draw as learners of them see: every fourth frame, small, exact copies."""
+"""Atari games (ale-py) with the usual preprocessing: frame skip, small pictures, exact copies of the console's state."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils.seeding import np_random
 
 from ..core.errors import TerrellaError
-from .gymnasium import Adapter, GymnasiumWorld, check_size
+from .gymnasium import Adapter, GymnasiumConfig, GymnasiumWorld, check_size
 from .observation_channels import resized
 from .snapshot import NotCopyable
 
@@ -21,13 +21,13 @@ FRAMES_PER_SECOND = 60
 class AtariWorld(GymnasiumWorld):
     """`AtariWorld("ALE/Breakout-v5")`: one step is `frames` frames of the console (Mnih et al. 2015).
 
-    size:   (height, width) of rgb, area-averaged from the screen of 210x160; None keeps the screen.
-    frames: of the console in a step, its last two merged by maximum, for sprites that flicker.
-    sticky: the chance that a step repeats the last action (Machado et al. 2018). With 0 the game is deterministic and
-            its states are values; else they are tickets.
-    noops:  an episode begins after 1 to `noops` frames without a button, drawn from the rng.
+    size:   (height, width) of rgb, area-averaged from the 210x160 screen; None keeps the screen's size.
+    frames: frame skip; the picture is the maximum of the last two frames, because sprites flicker.
+    sticky: probability that a frame repeats the last action (Machado et al. 2018). With 0 the game is deterministic and
+            forkable.
+    noops:  an episode starts after 1 to `noops` random no-op frames.
 
-    Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, when the game is over; lives float32 [B].
+    Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, at game over; lives float32 [B].
     """
 
     def __init__(
@@ -43,18 +43,19 @@ class AtariWorld(GymnasiumWorld):
     ):
         if not (0 <= sticky <= 1 and 1 <= frames <= 60 and noops >= 0):
             raise TerrellaError(
-                f"sticky={sticky} is a chance, 0 to 1; frames={frames} in a step are 1 to 60; noops={noops} are 0 or more."
+                f"sticky={sticky} must be a probability, frames={frames} from 1 to 60, noops={noops} 0 or more."
             )
         if forkable and sticky:
-            raise TerrellaError(f"with sticky={sticky} the game draws chances of its own: its states cannot be forked.")
+            raise TerrellaError(
+                f"with sticky={sticky} the game draws its own random numbers: its states cannot be forked."
+            )
         screen = check_size(size)
 
         def build() -> gymnasium.Env:
             return _Screen(_make(game, sticky), screen, frames, noops, sticky)
 
         names = tuple(_make(game, sticky).unwrapped.get_action_meanings())  # pyright: ignore[reportAttributeAccessIssue]
-        super().__init__(
-            build,
+        config = GymnasiumConfig(
             dt_s=frames / FRAMES_PER_SECOND,
             forkable=forkable if sticky == 0 else False,
             snapshots=_Savestates,
@@ -63,15 +64,16 @@ class AtariWorld(GymnasiumWorld):
             repeat=repeat,
             adapter=Adapter(action_names=names),
         )
+        super().__init__(build, config)
 
 
 def _make(game: str, sticky: float) -> gymnasium.Env:
-    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # its greeting would stand among our results
+    ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)  # its greeting would mix with our output
     gymnasium.register_envs(ale_py)
     try:
         return gymnasium.make(
             game,
-            obs_type="ram",  # the screen is fetched where it is needed
+            obs_type="ram",  # the screen is fetched only when needed
             frameskip=1,
             repeat_action_probability=sticky,
             max_episode_steps=-1,
@@ -82,7 +84,7 @@ def _make(game: str, sticky: float) -> gymnasium.Env:
 
 
 class _Screen(gymnasium.Wrapper):
-    """Steps of several frames; observations are small pictures."""
+    """Frame skip, no-op starts and small pictures."""
 
     def __init__(self, env: gymnasium.Env, size: tuple[int, int] | None, frames: int, noops: int, sticky: float):
         super().__init__(env)
@@ -96,7 +98,7 @@ class _Screen(gymnasium.Wrapper):
         if self.sticky or not self.loaded:
             self.env.reset(seed=seed, options=options)
             self.loaded = True
-        elif seed is not None:  # a full reset loads the game anew, 0.2 s, to seed dice that are not thrown
+        elif seed is not None:  # a full reset reloads the game, 0.2 s, for a seed that is not used
             self.unwrapped.np_random, _ = np_random(seed)
         self.ale.reset_game()
         info: dict = {"lives": self.ale.lives()}
@@ -121,7 +123,7 @@ class _Screen(gymnasium.Wrapper):
 
 
 class _Savestates:
-    """The console's own save states in place of sim/snapshot.py's numbers: see Snapshots for `take` and `put`."""
+    """The console's own save states instead of `Snapshots`, with the same methods."""
 
     def __init__(self, env: gymnasium.Env):
         self._width = len(self._bytes(env))

@@ -1,8 +1,8 @@
-"""Corrected: a simulator and, around it, a learned model of how the real robot differs: each step is put right by what was seen.
+"""Corrected: a simulator with a learned residual, which corrects each step by how a real robot differs from it.
 
-A world model of few real episodes: the simulator says most, a small ensemble the rest (residual physics, Zeng et al. 2019;
-neural-augmented simulation, Golemo et al. 2018). Play is told by a bank of play operators (Prandtl and Ishlinskii's model of
-hysteresis): few episodes do not teach a network to remember so far back.
+A world model from few real episodes: the simulator predicts most, a small ensemble the rest (residual physics, Zeng et al. 2019;
+neural-augmented simulation, Golemo et al. 2018). Backlash is an input as a bank of play operators (the Prandtl-Ishlinskii model
+of hysteresis), because few episodes do not teach a network such a long memory.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ from torch import nn
 from ..core.state import State
 from ..core.world import make_rng
 from .mujoco_world import MujocoWorld
-from .trials import PAST, PLAYS, Trials, driven, idle, placed
-from .wrapper import WorldWrapper
+from .trials import PAST, PLAYS, Trials, idle_actions, play_operators, with_joints
 
 MEMBERS, HIDDEN = 4, 64
 _PAST = "corrected.past"
 
 
 class Residual(nn.Module):
-    """What qpos and qvel [B, nq + nv] come to beyond the simulator's word, by joints, speeds and the last actions: the mean of an
-    ensemble, within what was seen."""
+    """The difference [B, nq + nv] of qpos and qvel between the robot and the simulator after a step, from joints, speeds and the
+    last actions: the mean of an ensemble, clamped to the range of its training targets."""
 
     mean: torch.Tensor
     scale: torch.Tensor
@@ -48,15 +47,15 @@ class Residual(nn.Module):
             self.register_buffer(name, torch.zeros(out))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Of each member, in units of what is usual: [members, B, out]."""
+        """The prediction of each member, in units of the targets' RMS: [members, B, out]."""
         scaled = ((inputs - self.mean) / self.scale).clamp(-5, 5)
         return torch.stack([member(scaled) for member in self.members])
 
-    def found(self, inputs: torch.Tensor) -> torch.Tensor:
+    def correction(self, inputs: torch.Tensor) -> torch.Tensor:
         return (self(inputs).mean(0) * self.unit).clamp(self.low, self.high)
 
-    def settle(self, inputs: torch.Tensor, targets: torch.Tensor) -> None:
-        """Tells it the size of what it will see and say."""
+    def fit_scales(self, inputs: torch.Tensor, targets: torch.Tensor) -> None:
+        """Sets the scales of inputs and outputs from training data."""
         self.mean.copy_(inputs.mean(0))
         self.scale.copy_(inputs.std(0).clamp_min(1e-3))
         self.unit.copy_(targets.square().mean(0).sqrt().clamp_min(1e-6))
@@ -65,27 +64,27 @@ class Residual(nn.Module):
 
 
 def inputs_of(qpos: torch.Tensor, qvel: torch.Tensor, drives: torch.Tensor) -> torch.Tensor:
-    """qpos [B, n], qvel [B, n] and the last drives [B, PAST + 1, 1 + PLAYS, nu], the newest last, as a Residual takes them."""
+    """The inputs of a Residual from qpos [B, n], qvel [B, n] and the last drives [B, PAST + 1, 1 + PLAYS, nu], the newest last."""
     return torch.cat([qpos, qpos.cos(), qpos.sin(), qvel, drives.flatten(1)], 1).float()
 
 
 @torch.no_grad()
-def residuals(world: MujocoWorld, trials: Trials) -> tuple[torch.Tensor, torch.Tensor]:
-    """Inputs [R, ...] and targets [R, nq + nv] of a Residual: by how much each real step went beyond the simulator's."""
-    known = trials.known.flatten()
-    drives, actions = trials.drives().flatten(0, 1)[known], trials.actions.flatten(0, 1)[known]
+def residual_targets(world: MujocoWorld, trials: Trials) -> tuple[torch.Tensor, torch.Tensor]:
+    """Inputs [R, ...] and targets [R, nq + nv] of a Residual: each real step minus the simulator's."""
+    valid = trials.valid.flatten()
+    drives, actions = trials.drives().flatten(0, 1)[valid], trials.actions.flatten(0, 1)[valid]
     (qpos, qvel), (qpos1, qvel1) = (
-        (trials.qpos[:, part].flatten(0, 1)[known], trials.qvel[:, part].flatten(0, 1)[known])
+        (trials.qpos[:, part].flatten(0, 1)[valid], trials.qvel[:, part].flatten(0, 1)[valid])
         for part in (slice(None, -1), slice(1, None))
     )
-    state = placed(world, world.start(len(qpos), make_rng(0)), actions[:, None][:, :0], qpos, qvel)
+    state = with_joints(world, world.start(len(qpos), make_rng(0)), actions[:, None][:, :0], qpos, qvel)
     physics = world.imagine(state, actions, make_rng(0))["physics"]
-    away = [qpos1 - physics[:, world.body.qpos], qvel1 - physics[:, world.body.qvel]]
-    return inputs_of(qpos, qvel, drives), torch.cat(away, 1).float()
+    difference = [qpos1 - physics[:, world.layout.qpos], qvel1 - physics[:, world.layout.qvel]]
+    return inputs_of(qpos, qvel, drives), torch.cat(difference, 1).float()
 
 
 class Corrected(WorldWrapper[MujocoWorld]):
-    """`Corrected(world, residual)`: the same world, each step of which is put right. Its state also holds the last drives."""
+    """`Corrected(world, residual)`: the world with corrected steps. Its state also holds the last drives."""
 
     def __init__(self, world: MujocoWorld, residual: Residual):
         self.world, self.residual = world, residual.eval().requires_grad_(False)
@@ -94,26 +93,25 @@ class Corrected(WorldWrapper[MujocoWorld]):
         )
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        before = idle(self.spec, batch)[:, None, None].repeat(1, PAST, 1 + len(PLAYS), 1)
+        before = idle_actions(self.spec, batch)[:, None, None].repeat(1, PAST, 1 + len(PLAYS), 1)
         return self.world.start(batch, rng).replace(**{_PAST: before})
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        return prior if prior is not None and not observation else self._first(observation, rng)
-
-    def _first(self, observation: Mapping[str, torch.Tensor], rng: torch.Generator) -> State:
-        self.world.observe(observation, None, rng)  # a simulator takes no evidence, and says so
+        if prior is not None and not observation:
+            return prior
+        self.world.observe(observation, None, rng)  # raises on an observation: a simulator accepts none
         return self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        moved, body = self.world.imagine(state, action, rng), self.world.body
-        now = driven(self.spec.check_action(action, state.batch), state[_PAST][:, -1])
+        stepped, layout = self.world.imagine(state, action, rng), self.world.layout
+        now = play_operators(self.spec.check_action(action, state.batch), state[_PAST][:, -1])
         drives = torch.cat([state[_PAST], now[:, None]], 1)
-        before, after = state["physics"], moved["physics"]
-        more = self.residual.found(inputs_of(before[:, body.qpos], before[:, body.qvel], drives))
-        more = torch.where(state["done"][:, None], 0.0, more)
-        qpos, qvel = more.tensor_split([len(body.home)], 1)
-        moved = self.world.replaced(state, moved, after[:, body.qpos] + qpos, after[:, body.qvel] + qvel)
-        return moved.replace(**{_PAST: drives[:, 1:]})
+        before, after = state["physics"], stepped["physics"]
+        change = self.residual.correction(inputs_of(before[:, layout.qpos], before[:, layout.qvel], drives))
+        change = torch.where(state["done"][:, None], 0.0, change)
+        qpos, qvel = change.tensor_split([len(layout.home)], 1)
+        corrected = self.world.with_joints(state, stepped, after[:, layout.qpos] + qpos, after[:, layout.qvel] + qvel)
+        return corrected.replace(**{_PAST: drives[:, 1:]})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         return self.world.render(state, channels)

@@ -1,9 +1,9 @@
 """ViZDoom as a World: the real game, with named buttons, exact depth and the camera's pose.
 
-Doom's own depth buffer has 8 bits (about 7 map units a level), so depth is cast exactly from the map's sectors, and
-the buffer is used only where it shows something else (a sprite). One metre is 32 map units, the usual reading.
-What may move or vanish (monsters, shots, pick-ups, doors, lifts) is marked in the channel `things`: no memory of the
-place should hold it. Each sprite among it is told apart: `objects` says where it stands, `instances` which pixels it covers.
+Doom's own depth buffer has 8 bits (about 7 map units per level), so depth is ray cast exactly from the map's sectors, and the
+buffer is used only where it shows something nearer (a sprite). One metre is 32 map units, the usual scale. The channel `things`
+masks everything that may move or vanish (monsters, shots, pick-ups, doors, lifts) and should not enter a map. `objects` has the
+position of each sprite, `instances` its pixels.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UNITS_PER_M = 32.0
 TICS_PER_S = 35
 MAX_DEPTH_M = 60.0
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT")
-MORE_BUTTONS = ("ATTACK", "USE")  # where the scenario's own configuration has them
+MORE_BUTTONS = ("ATTACK", "USE")  # if the scenario's configuration has them
 KEYS = {
     "KeyW": "MOVE_FORWARD",
     "KeyS": "MOVE_BACKWARD",
@@ -48,7 +48,7 @@ KEYS = {
 CAMERA = (0.5, 0.8, 0.5, 0.5)
 MAP_SPACING_M = 1024.0  # from one map of a game to the next: see `map_origin`
 HEALTH = spaces.Box(0, 1000, (), np.float32)
-OBJECTS = 16  # sprites that are told apart at most, the nearest
+OBJECTS = 16  # the nearest sprites that are listed
 PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
 SWITCHES = {"depth_buffer_enabled": True, "sectors_info_enabled": True, "audio_buffer_enabled": False}
 SWITCHES |= {"automap_buffer_enabled": False, "window_visible": False, "render_hud": False, "render_weapon": False}
@@ -58,32 +58,35 @@ _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map 
 
 @dataclass(frozen=True)
 class DoomConfig:
-    """scenario: a ViZDoom scenario's name, or maps of a game ("freedoom2/MAP01,MAP02"), of which each episode takes one;
-    size: rgb (height, width), 4:3; depth_size: likewise; timeout_tics: when an episode ends by itself, 0 for never;
-    skill: 1 to 5, how hard it is; None for the scenario's own, 3 on the maps of a game."""
+    """The settings of a Doom world."""
 
+    # A ViZDoom scenario, or maps of a game ("freedoom2/MAP01,MAP02"), one of which is drawn per episode.
     scenario: str = "my_way_home"
+    # (height, width) of rgb, 4:3.
     size: tuple[int, int] = (96, 128)
+    # (height, width) of depth and masks, 4:3.
     depth_size: tuple[int, int] = (96, 128)
+    # Time limit of an episode in tics, 0 for none.
     timeout_tics: int = 0
+    # Difficulty, 1 to 5. Default: the scenario's own, 3 on the maps of a game.
     skill: int | None = None
 
 
 class Doom:
-    """The game as a World. One process, one episode: not forkable, batch 1; a state is a ticket for the present.
+    """The game as a World: one process, one episode, not forkable, batch 1. A state is a ticket for the present.
 
-    A scenario that tells the player's health has the channels `health` and `things` (bool [h, w]: what may move or
-    vanish: sprites, doors and lifts), and the buttons ATTACK and USE where its configuration has them. `objects` [OBJECTS, 4] holds
-    of the sprites in sight, the nearest first, a number that stays its own (0: none) and where its feet are (x, y, z in
-    metres); `instances` uint8 [h, w] is at each pixel the row of `objects` that is seen there, counted from 1. On a map of a game
-    a kill and the exit pay 1, death costs 1, and episodes begin at the map's start or where a pick-up lies.
+    A scenario with the player's health has the channels `health`; `things` bool [h, w], the mask of sprites, doors and lifts;
+    `objects` [OBJECTS, 4], the visible sprites, nearest first: a persistent number (0: none) and the position of its feet, metres;
+    and `instances` uint8 [h, w], the row of `objects` at each pixel, counted from 1. It has the buttons ATTACK and USE if its
+    configuration has them. On a map of a game, a kill and the exit give reward 1, death gives -1, and episodes start at the map's
+    start or at a pick-up.
     """
 
     def __init__(self, config: DoomConfig | None = None):
         self.config = config = config or DoomConfig()
         height, width = config.size
         if min(height, width) < 1 or 384 % height or 512 % width or 384 // height != 512 // width:
-            raise TerrellaError(f"Doom renders at 384x512 divided by a whole number; size {height}x{width} is not.")
+            raise TerrellaError(f"Doom renders at 384x512 divided by an integer; {height}x{width} is not such a size.")
         self._shrink = 384 // height
         scenario, self._maps = _named(config.scenario)
         self._game, self.buttons, alive = _open_game(config, scenario, self._maps)
@@ -91,7 +94,7 @@ class Doom:
         self._places: dict[str, Sectors] = {}
         self._ticket = 0
         self._seen: dict[str, torch.Tensor] = {}
-        self._looked_at = -1
+        self._cast_at = -1
         channels: dict[str, spaces.Space] = {
             "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
             "depth": spaces.Box(0, MAX_DEPTH_M, config.depth_size, np.float32),
@@ -122,27 +125,27 @@ class Doom:
         )
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        """A new episode; where there are several maps or spawn points, `rng` picks."""
+        """A new episode; `rng` draws the map and the spawn point where there are several."""
         if batch != 1:
             raise TerrellaError(f"{self.spec.name} is one game process: start(1, rng), or open several.")
         self._game.set_seed(int(torch.randint(2**31 - 1, (1,), generator=rng).item()))
         if self._maps:
             self._game.set_doom_map(self._maps[int(torch.randint(len(self._maps), (1,), generator=rng))])
         self._game.new_episode()
-        self._enter()
+        self._enter_map()
         if self._maps:
-            self._step_in(rng)
+            self._start_at_pick_up(rng)
         self._reward, self._done = 0.0, False
         return self._advance()
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """A game cannot be put into a state from outside: evidence is ignored, the present (or a start) is returned."""
+        """The prior, or a start: a game cannot be set from an observation."""
         if observation:
-            raise ObservationError(f"{self.spec.name} is the real game and takes no evidence; call start(1, rng).")
+            raise ObservationError(f"{self.spec.name} is the real game and accepts no observation; call start(1, rng).")
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One tic of the game. After `done` the game stands still."""
+        """One tic of the game. After `done` it stands still."""
         buttons = self.spec.check_action(action, 1)
         self._check_present(state)
         if not self._done:
@@ -160,25 +163,25 @@ class Doom:
     def close(self) -> None:
         self._game.close()
 
-    def _enter(self) -> None:
-        """Takes up the geometry of the map that the episode is on."""
+    def _enter_map(self) -> None:
+        """Loads the geometry of the episode's map."""
         name, sectors = self._game.get_doom_map(), self._game.get_state().sectors
         if name not in self._places:
             self._places[name] = Sectors(sectors, skies(self._wad, name))
         self._walls, self._origin = self._places[name], map_origin(self._wad.stem, name) if self._maps else (0.0, 0.0)
         self._walls.update(sectors)
-        self._walls.began = self._walls.heights
+        self._walls.initial_heights = self._walls.heights
 
-    def _step_in(self, rng: torch.Generator) -> None:
-        """A map is wide and has one start: in three episodes of four the player stands where a pick-up lay."""
-        found = [thing for thing in self._game.get_state().objects if thing.category in PICK_UPS]
-        if found and float(torch.rand(1, generator=rng)) < 0.75:
-            place = found[int(torch.randint(len(found), (1,), generator=rng))]
+    def _start_at_pick_up(self, rng: torch.Generator) -> None:
+        """In three of four episodes, moves the player to a random pick-up, because a map has only one start."""
+        pick_ups = [thing for thing in self._game.get_state().objects if thing.category in PICK_UPS]
+        if pick_ups and float(torch.rand(1, generator=rng)) < 0.75:
+            place = pick_ups[int(torch.randint(len(pick_ups), (1,), generator=rng))]
             self._game.send_game_command(f"warp {place.position_x:.0f} {place.position_y:.0f}")
             self._game.make_action([0.0] * len(self.buttons), 2)
-            if self._game.is_episode_finished():  # it lay behind the exit
+            if self._game.is_episode_finished():  # it was behind the exit
                 self._game.new_episode()
-                self._enter()
+                self._enter_map()
 
     def _check_present(self, state: State) -> None:
         if int(state["ticket"][0]) != self._ticket:
@@ -208,37 +211,37 @@ class Doom:
             return torch.from_numpy(np.array(Image.fromarray(self._present.screen_buffer).reduce(self._shrink)))
         x, y, z, yaw_deg, health = (float(value) for value in np.asarray(self._present.game_variables))
         if name == "health":
-            dead = self._done and self._game.is_player_dead()  # of the dead there is no state, the last picture stays
+            dead = self._done and self._game.is_player_dead()  # after death there is no state, the last picture stays
             return torch.tensor(0.0 if dead else max(health, 0.0), dtype=torch.float32)
         if name == "pose":
             half = np.deg2rad(yaw_deg) / 2
             here = np.array([x, y, z]) / UNITS_PER_M + (*self._origin, 0.0)
             return torch.tensor([*here, np.cos(half), 0.0, 0.0, np.sin(half)], dtype=torch.float32)
         if name in ("objects", "instances"):
-            return torch.from_numpy(self._told_apart(x, y)[name])
-        depth, sector = self._looked(x, y, z, np.deg2rad(yaw_deg))
+            return torch.from_numpy(self._sprite_channels(x, y)[name])
+        depth, sector = self._cast(x, y, z, np.deg2rad(yaw_deg))
         if name == "things":
-            moved = self._walls.moved()
-            return torch.from_numpy(self._sprites() | np.append(moved, False)[sector])
+            dynamic = self._walls.dynamic()
+            return torch.from_numpy(self._sprites() | np.append(dynamic, False)[sector])
         depth_m = _with_sprites(depth, np.asarray(self._present.depth_buffer)) / UNITS_PER_M
         return torch.from_numpy(depth_m).float().clamp(0, MAX_DEPTH_M)
 
-    def _looked(self, x: float, y: float, z: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
-        """What is seen of the map's sectors now: depth [h, w] in map units and sector [h, w]."""
-        if self._looked_at != self._ticket:
+    def _cast(self, x: float, y: float, z: float, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+        """The current view of the map: depth [h, w] in map units and sector [h, w]."""
+        if self._cast_at != self._ticket:
             self._walls.update(self._present.sectors)
             size, farthest = self.config.depth_size, MAX_DEPTH_M * UNITS_PER_M
-            self._saw, self._looked_at = self._walls.depth(x, y, z, yaw, CAMERA, size, farthest), self._ticket
-        return self._saw
+            self._last_cast, self._cast_at = self._walls.depth(x, y, z, yaw, CAMERA, size, farthest), self._ticket
+        return self._last_cast
 
     def _sprites(self) -> np.ndarray:
-        """Where a sprite covers any of a pixel: bool [h, w]."""
+        """bool [h, w]: pixels that a sprite covers, even in part."""
         values = np.zeros(256, bool)
         values[[label.value for label in self._present.labels]] = True
         rows, columns = self.config.depth_size
         return _any_of(_any_of(values[self._present.labels_buffer], rows, 0), columns, 1)
 
-    def _told_apart(self, x: float, y: float) -> dict[str, np.ndarray]:
+    def _sprite_channels(self, x: float, y: float) -> dict[str, np.ndarray]:
         """`objects` and `instances` as seen from (x, y), in map units."""
         labels = [label for label in self._present.labels if label.object_name != "DoomPlayer"]
         labels.sort(key=lambda label: np.hypot(label.object_position_x - x, label.object_position_y - y))
@@ -252,14 +255,14 @@ class Doom:
 
 
 def map_origin(game: str, name: str) -> tuple[float, float]:
-    """Where a game's map lies in one wide world, metres: several can be learned together, and each place is one place."""
+    """The origin (x, y) of a game's map in one large world, metres, so that several maps can be learned together."""
     number = int("".join(re.findall(r"\d", name)) or 0)
     row = number // 6
     return MAP_SPACING_M * (number % 6), MAP_SPACING_M * (-1 - row if game.endswith("1") else row)
 
 
 def _named(scenario: str) -> tuple[str, tuple[str, ...]]:
-    """ "freedoom2/MAP01,MAP02" -> ("freedoom2", ("MAP01", "MAP02")); a scenario of its own has no maps to choose from."""
+    """(scenario, maps): "freedoom2/MAP01,MAP02" -> ("freedoom2", ("MAP01", "MAP02")); a ViZDoom scenario has no maps."""
     name, _, maps = scenario.partition("/")
     return name, tuple(part.strip().upper() for part in maps.split(",") if part.strip())
 
@@ -267,7 +270,7 @@ def _named(scenario: str) -> tuple[str, tuple[str, ...]]:
 def _open_game(
     config: DoomConfig, scenario: str, maps: tuple[str, ...]
 ) -> tuple[vizdoom.DoomGame, tuple[str, ...], bool]:
-    """The running game, its buttons, and whether it tells the player's health."""
+    """(the running game, its buttons, whether it has the player's health)."""
     _check_scenario(config, scenario, maps)
     game = vizdoom.DoomGame()
     game.load_config(str(Path(vizdoom.scenarios_path) / f"{scenario}.cfg"))
@@ -294,16 +297,16 @@ def _open_game(
         game.set_death_penalty(1.0)
     if config.skill is not None:
         game.set_doom_skill(config.skill)
-    game.add_game_args("+movebob 0")  # the head does not bob: its phase would be a hidden state
+    game.add_game_args("+movebob 0")  # no head bobbing, whose phase would be hidden state
     game.set_episode_timeout(config.timeout_tics)
     _begin(game, scenario)
     return game, buttons, alive
 
 
 def _check_scenario(config: DoomConfig, scenario: str, maps: tuple[str, ...]) -> None:
-    """Refuses what ViZDoom does not have, naming what it has."""
+    """TerrellaError for a scenario, map or skill that ViZDoom does not have."""
     if config.skill is not None and not 1 <= config.skill <= 5:
-        raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); {config.skill} is not one.")
+        raise TerrellaError(f"Doom's skill goes from 1 (easy) to 5 (nightmare); got {config.skill}.")
     games = sorted(path.stem for path in Path(vizdoom.__file__).parent.glob("freedoom*.wad"))
     known = sorted(path.stem for path in Path(vizdoom.scenarios_path).glob("*.cfg"))
     if scenario not in known:
@@ -311,24 +314,22 @@ def _check_scenario(config: DoomConfig, scenario: str, maps: tuple[str, ...]) ->
     if maps or scenario in games:
         have = map_names(Path(vizdoom.__file__).parent / f"{scenario}.wad") if scenario in games else []
         if not have:
-            raise TerrellaError(
-                f"'{scenario}' has no maps to choose from here; the games that have are {', '.join(games)}."
-            )
+            raise TerrellaError(f"'{scenario}' has no maps to choose from; games with maps are {', '.join(games)}.")
         if not maps or set(maps) - set(have):
-            wrong = ", ".join(sorted(set(maps) - set(have))) or "none was named"
+            wrong = ", ".join(sorted(set(maps) - set(have))) or "none is named"
             example = f"{scenario}/{have[0]} or {scenario}/{have[0]},{have[1]}"
-            raise TerrellaError(f"{scenario} has the maps {have[0]} to {have[-1]} ({wrong}); say {example}.")
+            raise TerrellaError(f"{scenario} has the maps {have[0]} to {have[-1]} ({wrong}); give {example}.")
 
 
 def _begin(game: vizdoom.DoomGame, scenario: str) -> None:
-    """Starts the process. The empty folder for saved games that ViZDoom makes in the working folder is taken away again."""
+    """Starts the process, and removes the empty folder for saved games that ViZDoom makes in the working directory."""
     saves = Path("_vizdoom")
     existed = saves.exists()
     try:
         game.init()
     except vizdoom.FileDoesNotExistException as error:
         raise TerrellaError(
-            f"{scenario} needs a file that ViZDoom does not bring ({error}); choose another."
+            f"{scenario} needs a file that ViZDoom does not include ({error}); choose another."
         ) from error
     finally:
         if not existed:
@@ -337,25 +338,25 @@ def _begin(game: vizdoom.DoomGame, scenario: str) -> None:
 
 
 def _wad(game: vizdoom.DoomGame) -> Path:
-    """The file that holds the map: the scenario's, or the game's."""
+    """The WAD with the map: the scenario's, or the game's."""
     own = Path(game.get_doom_scenario_path())
     return own if own.is_file() else Path(game.get_doom_game_path())
 
 
 def _any_of(mask: np.ndarray, count: int, axis: int) -> np.ndarray:
-    """bool, `axis` made `count` long: True where any of its part is."""
+    """Reduces `axis` of a bool array to length `count` by any()."""
     return np.logical_or.reduceat(mask, np.arange(count) * mask.shape[axis] // count, axis)
 
 
 def _with_sprites(exact: np.ndarray, buffer: np.ndarray) -> np.ndarray:
-    """Depth in map units; where the 8-bit buffer is clearly nearer than the map (a thing stands there), the buffer's."""
+    """Depth in map units, from the 8-bit buffer where that is clearly nearer than the map (a sprite)."""
     level = _sampled(buffer, exact.shape).astype(np.float32)
     coarse = (level + 0.5 - _BUFFER_OFFSET) / _BUFFER_SLOPE
     return np.where((coarse < exact * 0.85 - 16) & (level > 1), coarse, exact)
 
 
 def _sampled(buffer: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """[H, W] -> [h, w], the value in the middle of each pixel."""
+    """[H, W] -> [h, w], the value at the centre of each pixel."""
     rows = (np.arange(size[0]) * 2 + 1) * buffer.shape[0] // (2 * size[0])
     columns = (np.arange(size[1]) * 2 + 1) * buffer.shape[1] // (2 * size[1])
     return buffer[np.ix_(rows, columns)]

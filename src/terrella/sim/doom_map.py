@@ -1,4 +1,4 @@
-"""A Doom map as geometry: the maps of a WAD, and sectors whose floors, ceilings and edges are cast into exact depth."""
+"""A Doom map as geometry: the maps of a WAD, and exact depth by ray casting its sectors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SKY = b"F_SKY1"
 
 @lru_cache(maxsize=8)
 def lumps(wad: Path) -> list[tuple[str, int, int]]:
-    """The directory of a WAD: (name, offset, length) of each lump; TerrellaError where it is none."""
+    """The directory of a WAD: (name, offset, length) of each lump; TerrellaError where it is not a WAD."""
     try:
         with open(wad, "rb") as file:
             kind, count, where = struct.unpack("<4sii", file.read(12))
@@ -28,7 +28,7 @@ def lumps(wad: Path) -> list[tuple[str, int, int]]:
         if kind not in (b"IWAD", b"PWAD") or len(table) != 16 * count:
             raise struct.error("not a WAD")
     except (OSError, struct.error) as error:
-        raise TerrellaError(f"{wad} is no WAD of Doom's ({error}); install ViZDoom again.") from error
+        raise TerrellaError(f"{wad} is not a Doom WAD ({error}); install ViZDoom again.") from error
     entries = struct.iter_unpack("<ii8s", table)
     return [(name.rstrip(b"\0").decode("latin-1"), offset, length) for offset, length, name in entries]
 
@@ -38,7 +38,7 @@ def map_names(wad: Path) -> list[str]:
 
 
 def skies(wad: Path, name: str) -> np.ndarray:
-    """Whether the ceiling of each sector of map `name` is the open sky: bool [S]; empty where the map does not say."""
+    """bool [S]: whether the ceiling of each sector of map `name` is open sky; empty where the map does not say."""
     table = lumps(wad)
     at = [entry[0].upper() for entry in table].index(name.upper())
     for kind, offset, length in table[at + 1 : at + 12]:
@@ -55,8 +55,9 @@ def skies(wad: Path, name: str) -> np.ndarray:
 
 
 class Sectors:
-    """The map as prisms. Floors and ceilings move: `update` reads them again, and `moved` says whose differ from how the
-    episode began (an open door, a lift on its way), or have no height at all (a closed door)."""
+    """The map as prisms. Floors and ceilings move: `update` reads their heights again; `dynamic` marks the sectors that differ from
+    the start of the episode (an open door, a moving lift) or have no height (a closed door).
+    """
 
     def __init__(self, sectors, sky: np.ndarray):
         lines = [np.array([(w.x1, w.y1, w.x2, w.y2) for w in s.lines], np.float64).reshape(-1, 4) for s in sectors]
@@ -65,9 +66,11 @@ class Sectors:
         self.lines, blocks = np.concatenate(lines), np.concatenate(blocking)
         ends = [tuple(sorted([(x1, y1), (x2, y2)])) for x1, y1, x2, y2 in self.lines]
         times = Counter(ends)
-        alone = np.array([times[pair] == 1 for pair in ends])  # of one sector only: a wall, or a line within the sector
+        alone = np.array(
+            [times[pair] == 1 for pair in ends]
+        )  # lines of one sector only: walls, or lines inside the sector
         keep = ~(alone & ~blocks)
-        for _ in range(4):  # a fence within a sector has an end that leads nowhere
+        for _ in range(4):  # a fence inside a sector has a loose end
             corners = Counter((s, point) for s, pair, kept in zip(owner, ends, keep) if kept for point in pair)
             loose = [any(corners[s, point] == 1 for point in pair) for s, pair in zip(owner, ends)]
             keep &= ~(alone & np.array(loose))
@@ -75,20 +78,20 @@ class Sectors:
         self.first = np.searchsorted(owner, np.arange(len(lines) + 1))
         self.sky = sky if len(sky) == len(lines) else np.zeros(len(lines), bool)
         self.update(sectors)
-        self.began = self.heights
+        self.initial_heights = self.heights
 
     def update(self, sectors) -> None:
-        """Takes over the heights of the map's present sectors."""
+        """Reads the current heights of the sectors."""
         self.heights = np.array([(sector.floor_height, sector.ceiling_height) for sector in sectors], np.float64)
 
-    def moved(self) -> np.ndarray:
-        """bool [S]"""
-        return (self.heights != self.began).any(1) | (self.heights[:, 0] >= self.heights[:, 1])
+    def dynamic(self) -> np.ndarray:
+        """bool [S]: the sectors that have moved or are closed."""
+        return (self.heights != self.initial_heights).any(1) | (self.heights[:, 0] >= self.heights[:, 1])
 
     def depth(
         self, x: float, y: float, eye: float, yaw: float, camera: Intrinsics, size: tuple[int, int], farthest: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Depth along the optical axis float64 [H, W], and which sector is seen (-1: a wall, the sky) int32 [H, W].
+        """Depth along the optical axis float64 [H, W], and the visible sector int32 [H, W] (-1: a wall, the sky).
 
         Map coordinates and units, yaw in radians.
         """

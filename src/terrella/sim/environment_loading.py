@@ -1,4 +1,4 @@
-"""Opens Gymnasium environments, and says in one sentence why one does not open, start or draw."""
+"""Makes Gymnasium environments, and explains in one sentence why one cannot be made, reset or rendered."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from . import islet  # noqa: F401  it registers Islet-v0
 
 _DISPLAY = re.compile(r"display|video device|gl context|\b(glfw|opengl|egl|osmesa|x11|glx|xlib)\b")
 
-_EXTRA = re.compile(r"gymnasium\[(box2d|mujoco)\]")  # what Gymnasium asks for, and we under the same name
+_EXTRA = re.compile(r"gymnasium\[(box2d|mujoco)\]")  # extras of Gymnasium that are also ours
 
 
 def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> tuple[gymnasium.Env, str]:
-    """(environment, name) of an id, "module:Id", or of a function. One from an id is made
-    without its limit; modules are found in the working directory too. TerrellaError says why it cannot be."""
+    """(environment, name) of an id, "module:Id" or a function. An id is made without its time limit; modules are also searched in
+    the working directory. TerrellaError where it cannot be made.
+    """
     if callable(env):
         built = env()
         return built, f"gym:{built.spec.id if built.spec else type(built.unwrapped).__name__}"
@@ -38,14 +39,16 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
             if rgb and "rgb_array" in (built.metadata.get("render_modes") or ()):
                 built.close()
                 built = gymnasium.make(env, render_mode="rgb_array", **options)
-                follow(built)
+                use_tracking_camera(built)
             return built, f"gym:{env}"
         except (gymnasium.error.NameNotFound, gymnasium.error.NamespaceNotFound) as error:
-            said = _ended(error).replace("mean: ", "mean ")
+            reason = _ended(error).replace("mean: ", "mean ")
             hint = (
-                "" if module or "Did you mean" in said else " If its package is installed, say which: gym:PACKAGE:ID."
+                ""
+                if module or "Did you mean" in reason
+                else " If it is in an installed package, name it: gym:PACKAGE:ID."
             )
-            raise TerrellaError(f"Gymnasium cannot make '{env}': {said}{hint}") from error
+            raise TerrellaError(f"Gymnasium cannot make '{env}': {reason}{hint}") from error
         except (gymnasium.error.Error, TypeError) as error:
             if extra := _EXTRA.search(str(error)):
                 raise TerrellaError(
@@ -54,9 +57,8 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
             raise TerrellaError(f"Gymnasium cannot make '{env}': {error}") from error
 
 
-def follow(env: gymnasium.Env) -> None:
-    """Has a MuJoCo environment drawn by its model's camera `track` where its own view follows nothing, so that who runs stays in
-    the picture."""
+def use_tracking_camera(env: gymnasium.Env) -> None:
+    """Renders a MuJoCo environment from its model's camera `track` if its default view is static, so that runners stay visible."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     if renderer is None or renderer.camera_id != -1 or "trackbodyid" in (renderer.default_cam_config or {}):
         return
@@ -67,7 +69,7 @@ def follow(env: gymnasium.Env) -> None:
 
 @contextmanager
 def explained(name: str, doing: str, module: str = "") -> Iterator[None]:
-    """Whatever an environment raises while it is made, reset or drawn becomes one sentence; `module`: where it is looked for."""
+    """Turns every error of an environment while it is made, reset or rendered into a TerrellaError; `module`: its module."""
     try:
         yield
     except (TerrellaError, KeyboardInterrupt):
@@ -83,8 +85,8 @@ def _sentence(name: str, doing: str, module: str, error: Exception) -> str:
     )  # Gymnasium raises another in its place
     if isinstance(error, ModuleNotFoundError) and missing and module and missing == module[: len(missing)]:
         return (
-            f"there is no Python module '{module}' to find {name} in; pip install the package that has it, or run this in the "
-            f"folder of {missing}.py."
+            f"the Python module '{module}' of {name} was not found; pip install its package, or run this in the folder of "
+            f"{missing}.py."
         )
     if isinstance(error, ModuleNotFoundError) and missing:
         return f"{name} needs the package '{missing}', which is not installed: pip install it."
@@ -93,20 +95,20 @@ def _sentence(name: str, doing: str, module: str, error: Exception) -> str:
             f"{name} cannot draw without a display ({_ended(error)}) Set MUJOCO_GL=egl or MUJOCO_GL=osmesa for MuJoCo, "
             "PYGLET_HEADLESS=true for pyglet, SDL_VIDEODRIVER=dummy for pygame, or run it under xvfb-run."
         )
-    return f"{name} fails when it is {doing}, by an error of its own: {type(error).__name__}: {_ended(error)}"
+    return f"{name} fails when it is {doing}, with its own error: {type(error).__name__}: {_ended(error)}"
 
 
 def _ended(error: Exception) -> str:
-    """Its first line, as a sentence."""
+    """The first line of an error, as a sentence."""
     first = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(". ")
     return first if first.endswith("?") else f"{first}."
 
 
 def picture_size(env: gymnasium.Env, name: str) -> tuple[int, int] | None:
-    """(height, width) of the picture that a freshly reset environment draws, or None."""
+    """(height, width) of the picture of an environment after a reset, or None."""
     if env.render_mode != "rgb_array":
         return None
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would go to stdout, among our results
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would mix with our output
     with explained(name, "drawn"):
         try:
             picture = env.render()
@@ -118,15 +120,15 @@ def picture_size(env: gymnasium.Env, name: str) -> tuple[int, int] | None:
 
 
 def load_adapter(source: str) -> Any:
-    """The `adapter` of a Python file, or of "FILE.py:NAME" the object of that name; TerrellaError where there is none."""
+    """The object `adapter` in a Python file, or NAME in "FILE.py:NAME"; TerrellaError where there is none."""
     path, _, name = source.partition(":")
     name = name or "adapter"
     if not Path(path).is_file():
         raise TerrellaError(f"there is no file {path}; --adapter takes a Python file, or FILE.py:NAME.")
     try:
-        found = runpy.run_path(path).get(name)
+        adapter = runpy.run_path(path).get(name)
     except Exception as error:
         raise TerrellaError(f"{path} fails: {type(error).__name__}: {_ended(error)}") from error
-    if found is None:
-        raise TerrellaError(f"{path} has no '{name}'; it ends with adapter = Adapter(...), or name it as {path}:NAME.")
-    return found() if isinstance(found, type) else found
+    if adapter is None:
+        raise TerrellaError(f"{path} has no '{name}'; define adapter = Adapter(...), or give {path}:NAME.")
+    return adapter() if isinstance(adapter, type) else adapter

@@ -1,10 +1,10 @@
-"""Any Gymnasium environment as a World; where its state can be copied exactly, it forks, batches and plans."""
+"""Any Gymnasium environment as a World. If its state can be copied exactly, it can fork, batch and plan."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any
 
@@ -19,8 +19,8 @@ from ..core.state import State
 from ..core.world import make_rng
 from .environment_facts import EnvironmentFacts, facts_of
 from .environment_loading import build, explained, picture_size
-from .observation_channels import check_space, followed, parts_of, resized, space_of
-from .processes import MOST, Processes
+from .observation_channels import check_space, parts_of, resized, space_of, value_at
+from .processes import MAX_EPISODES, Processes
 from .snapshot import NotCopyable, Snapshots
 
 _TRIALS, _TRIAL_STEPS = 3, 40
@@ -28,18 +28,18 @@ _TRIALS, _TRIAL_STEPS = 3, 40
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel that an environment can show: `read(env)` gives one value [*space.shape] of the environment as it now stands.
-    `read` may be the way to it: "info.depth" (a key of `info`), "camera.pose" (attributes, methods too). Without a space,
-    that of the first value."""
+    """A further channel of an environment."""
 
+    # A function of the bare environment that returns the current value [*space.shape]; or a path: "info.depth" (a key of `info`),
+    # "camera.pose" (attributes and methods).
     read: Callable[[gymnasium.Env], np.ndarray | float] | str
-    space: spaces.Space | None = None
+    space: spaces.Space | None = None  # default: from the first value
     unit: str = ""
 
 
 @dataclass(frozen=True)
 class Adapter:
-    """What an environment has beyond Gymnasium's own words, so that a world with depth and poses can be learned of it.
+    """What Gymnasium has no term for, such as depth and poses, so that a posed world can be learned from an environment.
 
         class MyGame(gymnasium.Env):
             terrella = Adapter(
@@ -50,14 +50,13 @@ class Adapter:
                 cameras={"rgb": Camera((0.5, 0.67, 0.5, 0.5), (96, 128))},
             )
 
-    channels: name -> Channel. depth: metres along the optical axis; pose: x, y, z in metres and quaternion w, x, y, z of
-              T_world_cam, world z up, camera x forward, y left, z up; "rgb.wrist" and the like are further cameras.
-    cameras:  picture channel -> Camera.
-    action_names, action_units, action_mode, action_frame, keys, idle: as in Spec; what is left out, the environment is asked.
+    The fields on actions are those of Spec. The default of names and keys comes from the environment.
     """
 
+    # depth: metres along the optical axis. pose: x, y, z in metres and quaternion w, x, y, z of T_world_cam; world z up; camera x
+    # forward, y left, z up. Names such as "rgb.wrist" are further cameras.
     channels: Mapping[str, Channel] = field(default_factory=dict)
-    cameras: Mapping[str, Camera] = field(default_factory=dict)
+    cameras: Mapping[str, Camera] = field(default_factory=dict)  # picture channel -> Camera
     action_names: tuple[str, ...] = ()
     action_units: tuple[str, ...] = ()
     action_mode: str = ""
@@ -66,87 +65,89 @@ class Adapter:
     idle: tuple[float, ...] = ()
 
 
+@dataclass(frozen=True)
+class GymnasiumConfig:
+    """The settings of a GymnasiumWorld."""
+
+    # Show `rgb`, if the environment renders with render_mode="rgb_array". An observation that is a picture (uint8 or floats up to
+    # 1; [H, W, 3], [3, H, W] or grey) is shown as `rgb` instead of `observation`.
+    rgb: bool = True
+    # (height, width) to which rgb is area-averaged; None for its own size.
+    size: tuple[int, int] | None = None
+    # Numbers in `info` that become channels, float32 [B], such as ("lives",).
+    info_channels: Sequence[str] = ()
+    # Whether states can be forked. None: tested by copying the state between two instances, whose steps must agree bit for bit.
+    # False: a state is only a ticket for the present, and parallel episodes run in processes of their own.
+    forkable: bool | None = None
+    # How states are copied. Default: sim/snapshot.py.
+    snapshots: Callable[[gymnasium.Env], Any] | None = None
+    # Seconds per step. Default: the environment's `dt` or `tau`, else from its frame rate, else 0.1.
+    dt_s: float | None = None
+    # Name for the spec. Default: the environment's.
+    name: str = ""
+    # Further channels and the meaning of actions. Default: the environment's attribute `terrella`.
+    adapter: Adapter | None = None
+    # Action repeat: environment steps per step of the world, with summed rewards.
+    repeat: int = 1
+    # Arguments of gymnasium.make.
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @staticmethod
+    def of(**settings: Any) -> GymnasiumConfig:
+        """The config of these settings; those that are not its fields become `options`."""
+        own = {one.name for one in fields(GymnasiumConfig)} - {"options"}
+        options = {name: value for name, value in settings.items() if name not in own}
+        return GymnasiumConfig(**{name: settings[name] for name in own & set(settings)}, options=options)
+
+
 class GymnasiumWorld:
-    """`GymnasiumWorld("CartPole-v1")`, or a function that builds an environment.
+    """`GymnasiumWorld("CartPole-v1")`.
 
-    env:      an id, which is made without its time limit (that is Spec.max_episode_steps, which `as_env` keeps),
-              or a function that returns a new environment each time it is called.
-    rgb:      also show `rgb`, where the environment draws itself with render_mode="rgb_array". Where its observation is
-              a picture already (uint8 or floats up to 1, [H, W, 3], [3, H, W] or grey), that is `rgb`, and takes the place of
-              `observation`. Of a dictionary each entry that is an array is a channel.
-    size:     (height, width) to which rgb is area-averaged; None leaves it as it is drawn.
-    info_channels: numbers of the environment's `info` that become channels, float32 [B]: ("lives",).
-    forkable: None finds out: an environment whose Python state is plain numbers is copied between two instances on
-              trial, and only if every step agrees bit for bit are its states values. False makes states tickets for
-              the present, and several episodes at once run in processes, each with an environment of its own.
-    snapshots: what copies the environment's state, by default sim/snapshot.py.
-    name:     for the spec, where the environment's own says too little.
-    adapter:  further channels (depth, pose, more cameras) and what actions mean; by default the attribute `terrella` of
-              the environment, where it has one.
-    dt_s:     seconds in a step; by default the environment's own `dt` or `tau`, else one over its frames per second, else 0.1.
-    repeat:   steps of the environment in one of the world (action repeat): each action is held for so many, rewards are added up.
-    options:  handed to gymnasium.make.
+    env: an id, made without its time limit (which becomes Spec.max_episode_steps, kept by `as_env`), or a function that returns a
+         new environment at each call.
 
-    Channels: observation [B, *shape], reward float32 [B], done bool [B] (terminated, or truncated by the environment
-    itself; then the state's `truncated` says so), rgb uint8 [B, H, W, 3]. After `done` the world stands still with reward 0.
-    Chance comes from `rng`: at `start`, and where states are values at each `imagine` too. spec.card["how"] says what is known
-    from where. Raises TerrellaError, a sentence, for what cannot be found, made, reset or drawn, and for Tuple spaces.
+    Channels: observation [B, *shape] (each array of a Dict is its own channel), reward float32 [B], done bool [B] (terminated, or
+    truncated by the environment, see `truncated` in the state), rgb uint8 [B, H, W, 3]. After `done` the world stands still with
+    reward 0. `start` uses `rng`, and so does each `imagine` if the world is forkable. spec.card["how"] says where facts about the
+    environment come from. TerrellaError where the environment cannot be found, made, reset or rendered, and for Tuple spaces.
     """
 
-    def __init__(
-        self,
-        env: str | Callable[[], gymnasium.Env],
-        *,
-        rgb: bool = True,
-        size: tuple[int, int] | None = None,
-        info_channels: Sequence[str] = (),
-        forkable: bool | None = None,
-        snapshots: Callable[[gymnasium.Env], Any] | None = None,
-        dt_s: float | None = None,
-        name: str = "",
-        adapter: Adapter | None = None,
-        repeat: int = 1,
-        **options,
-    ):
-        self._lock = threading.Lock()  # one environment serves all episodes, so only one may move at a time
-        self._env, found = build(env, rgb, options)
-        found = found if repeat == 1 else f"{found}@{repeat}"
-        self._name, self._size, self._info = name or found, check_size(size), tuple(info_channels)
+    def __init__(self, env: str | Callable[[], gymnasium.Env], config: GymnasiumConfig = GymnasiumConfig()):
+        self._lock = threading.Lock()  # all episodes share one environment, so only one may step at a time
+        rgb, options, repeat = config.rgb, dict(config.options), config.repeat
+        self._env, own_name = build(env, rgb, options)
+        own_name = own_name if repeat == 1 else f"{own_name}@{repeat}"
+        self._name, self._size, self._info = (
+            config.name or own_name,
+            check_size(config.size),
+            tuple(config.info_channels),
+        )
         self._repeat = repeat
         check_space(self._env.action_space, self._name)
-        drawn = rgb and self._env.render_mode == "rgb_array"
-        self._parts = parts_of(self._env.observation_space, self._name, rgb, drawn)
+        renders = rgb and self._env.render_mode == "rgb_array"
+        self._parts = parts_of(self._env.observation_space, self._name, rgb, renders)
         with explained(self._name, "reset"):
             self._env.reset(seed=0)
         self._snapshots, self._viewer = None, self._env
-        if forkable is not False:
-            self._copied(build(env, rgb, options)[0], snapshots or Snapshots, bool(forkable))
+        if config.forkable is not False:
+            self._try_forking(build(env, rgb, options)[0], config.snapshots or Snapshots, bool(config.forkable))
         self._ticket = 0
         self._processes: Processes | None = None
-        same = {
-            "rgb": rgb,
-            "size": size,
-            "info_channels": info_channels,
-            "dt_s": dt_s,
-            "name": name,
-            "adapter": adapter,
-            "repeat": repeat,
-        }
-        self._another = partial(GymnasiumWorld, env, forkable=False, **same, **options)
+        self._make_another = partial(GymnasiumWorld, env, replace(config, forkable=False, snapshots=None))
         with explained(self._name, "reset"):
             seen, info = self._env.reset(seed=0)
-        chosen: Adapter = adapter or getattr(self._env.unwrapped, "terrella", Adapter())
-        settled = {at: self._settled(at, channel, info) for at, channel in chosen.channels.items()}
-        self._adapter = replace(chosen, channels=settled)
-        self._kept = {at: one.read for at, one in settled.items() if str(one.read).startswith("info.")}
-        self._drawn = self._picture_size(seen, rgb)
-        self.spec = self._describe(facts_of(self._env, chosen.action_names), dt_s)
+        adapter: Adapter = config.adapter or getattr(self._env.unwrapped, "terrella", Adapter())
+        channels = {at: self._with_space(at, channel, info) for at, channel in adapter.channels.items()}
+        self._adapter = replace(adapter, channels=channels)
+        self._info_paths = {at: one.read for at, one in channels.items() if str(one.read).startswith("info.")}
+        self._rgb_size = self._picture_size(seen, rgb)
+        self.spec = self._describe(facts_of(self._env, adapter.action_names), config.dt_s)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
         self.spec = replace(self.spec, max_episode_steps=-(-limit // repeat) if limit and limit > 0 else None)
 
-    def _copied(self, twin: gymnasium.Env, copier: Callable, must: bool) -> None:
+    def _try_forking(self, twin: gymnasium.Env, copier: Callable, must: bool) -> None:
         self._snapshots, why = _try_copying(self._env, twin, copier)
         if self._snapshots is not None:
             self._viewer = twin
@@ -154,7 +155,7 @@ class GymnasiumWorld:
             return
         twin.close()
         if must:
-            raise TerrellaError(f"{self._name} cannot be copied ({why}); leave out forkable=True.")
+            raise TerrellaError(f"{self._name} cannot be copied ({why}); leave forkable=True out.")
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` resets of the environment, seeded from `rng`."""
@@ -164,36 +165,38 @@ class GymnasiumWorld:
             )
         with self._lock:
             if self._snapshots is None and batch > 1 and self._processes is None:
-                self._processes = Processes(self.spec.name, self._another)
+                self._processes = Processes(self.spec.name, self._make_another)
             if self._processes is not None:
                 return self._processes.start(_seeds(batch, rng))
             return self._state([self.begin(seed) for seed in _seeds(batch, rng)])
 
     def begin(self, seed: int) -> dict[str, np.ndarray]:
-        """Resets the one environment: what is seen of it."""
+        """Resets the environment; returns its channels."""
         with explained(self._name, "reset"):
             observation, info = self._env.reset(seed=seed)
             return self._row(observation, 0.0, False, False, info)
 
-    def move(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Steps the one environment, `repeat` times or until the episode ends: what is seen of it."""
+    def step(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Steps the environment `repeat` times or until the episode ends; returns its channels."""
         with explained(self._name, "stepped"):
-            earned = 0.0
+            total = 0.0
             for _ in range(self._repeat):
                 seen, reward, terminated, truncated, info = self._env.step(action)
-                earned += float(reward)
+                total += float(reward)
                 if terminated or truncated:
                     break
-            return self._row(seen, earned, terminated, truncated, info)
+            return self._row(seen, total, terminated, truncated, info)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
+        """The prior, or a start: a simulator cannot be set from an observation."""
         if observation:
-            raise ObservationError(f"{self.spec.name} is a simulator and takes no evidence; pass an empty mapping.")
+            raise ObservationError(
+                f"{self.spec.name} is a simulator and accepts no observation; pass an empty mapping."
+            )
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One step of the environment for each batch entry; entries that are done stand still with reward 0."""
+        """One step of each batch entry; entries that are done stand still with reward 0."""
         self._check(state)
         actions = self.spec.check_action(action, state.batch).cpu().numpy()
         with self._lock:
@@ -209,7 +212,7 @@ class GymnasiumWorld:
                 if self._snapshots is not None:
                     self._snapshots.put(self._env, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
                     _reseed(self._env, seed)
-                rows.append(self.move(actions[entry]))
+                rows.append(self.step(actions[entry]))
             return self._state(rows)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
@@ -235,15 +238,13 @@ class GymnasiumWorld:
             "done": np.bool_(terminated or truncated),
             "truncated": np.bool_(truncated and not terminated),
             **{name: np.float32(info[name]) for name in self._info},
-            **{name: self._fitting(name, followed(None, info, str(path))) for name, path in self._kept.items()},
+            **{name: self._fitting(name, value_at(None, info, str(path))) for name, path in self._info_paths.items()},
         }
         if self._snapshots is not None:
             try:
                 numbers, kinds = self._snapshots.take(self._env)
             except NotCopyable as error:
-                message = (
-                    f"{self.spec.name} turned out to hold what cannot be copied: {error}; open it with forkable=False."
-                )
+                message = f"{self.spec.name} has state that cannot be copied: {error}; open it with forkable=False."
                 raise TerrellaError(message) from error
             row["numbers"], row["kinds"] = np.array(numbers, np.float64), np.array(kinds, np.uint8)
         return row
@@ -258,7 +259,7 @@ class GymnasiumWorld:
     def _check(self, state: State) -> None:
         if self._processes is not None:
             if "episode" not in state:
-                raise StaleStateError(f"{self.spec.name} plays in processes since this state; start again.")
+                raise StaleStateError(f"{self.spec.name} runs in processes since this state; start again.")
         elif self._snapshots is None:
             if "ticket" not in state or state.batch != 1 or int(state["ticket"][0]) != self._ticket:
                 raise StaleStateError(
@@ -268,29 +269,29 @@ class GymnasiumWorld:
             raise TerrellaError(f"this is not a state of {self.spec.name}: {state}.")
 
     def _read(self, name: str, state: State) -> torch.Tensor:
-        """A channel that is made when it is asked for: what the environment draws, or what its adapter reads off it."""
+        """A channel that is computed on demand: the environment's picture, or a channel of its adapter."""
         with self._lock:
-            found = []
+            values = []
             for entry in range(state.batch):
                 if self._snapshots is not None:
                     self._snapshots.put(self._viewer, state["numbers"][entry].tolist(), state["kinds"][entry].tolist())
-                found.append(self.look(name))
-        return torch.from_numpy(np.stack(found))
+                values.append(self.look(name))
+        return torch.from_numpy(np.stack(values))
 
     def look(self, name: str) -> np.ndarray:
-        """One channel of the environment as it now stands."""
+        """The current value of one channel."""
         channel, bare = self._adapter.channels.get(name), self._viewer.unwrapped
         with explained(self._name, "drawn" if channel is None else f"asked for its {name}"):
             if channel is None:
                 return self._fitting(name, self._sized(np.asarray(self._viewer.render())))
             read = channel.read
-            return self._fitting(name, followed(bare, {}, read) if isinstance(read, str) else read(bare))
+            return self._fitting(name, value_at(bare, {}, read) if isinstance(read, str) else read(bare))
 
     def _sized(self, picture: np.ndarray) -> np.ndarray:
-        if self._size is None and picture.shape[:2] != self._drawn:
-            now, before = ("x".join(map(str, (size or ())[:2])) for size in (picture.shape, self._drawn))
+        if self._size is None and picture.shape[:2] != self._rgb_size:
+            now, before = ("x".join(map(str, (size or ())[:2])) for size in (picture.shape, self._rgb_size))
             raise TerrellaError(
-                f"the pictures of {self._name} change their size, from {before} to {now}; give one for all (--size 64 64)."
+                f"the pictures of {self._name} change their size, from {before} to {now}; give a fixed size (--size 64 64)."
             )
         return resized(picture, self._size)
 
@@ -301,52 +302,52 @@ class GymnasiumWorld:
             raise TerrellaError(f"{self.spec.name} gave '{name}' of shape {array.shape}; its space is {space}.")
         return array
 
-    def _settled(self, name: str, channel: Channel, info: Mapping) -> Channel:
-        """The channel with a space, if need be that of its present value."""
+    def _with_space(self, name: str, channel: Channel, info: Mapping) -> Channel:
+        """The channel with a space, by default that of its current value."""
         if channel.space is not None:
             return channel
         try:
             bare, read = self._env.unwrapped, channel.read
-            value = followed(bare, info, read) if isinstance(read, str) else read(bare)
+            value = value_at(bare, info, read) if isinstance(read, str) else read(bare)
             return replace(channel, space=space_of(value, kind_of(name)))
         except TerrellaError as error:
             raise TerrellaError(f"the channel '{name}' of {self._name} cannot be read: {error}") from error
 
     def _picture_size(self, observation: Any, rgb: bool) -> tuple[int, int] | None:
-        """(height, width) of the pictures as they come; None without any."""
+        """(height, width) of the pictures before resizing; None without pictures."""
         if "rgb" in self._parts:
             height, width = self._parts["rgb"].read(observation, self._name).shape[:2]
             return height, width
         return picture_size(self._viewer, self._name) if rgb else None
 
-    def _describe(self, told: EnvironmentFacts, dt_s: float | None) -> Spec:
+    def _describe(self, facts: EnvironmentFacts, dt_s: float | None) -> Spec:
         channels = {name: part.space for name, part in self._parts.items() if name != "rgb"}
         channels |= {"reward": REWARD, "done": DONE}
         channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}
-        if self._drawn is not None:
-            channels["rgb"] = spaces.Box(0, 255, (*(self._size or self._drawn), 3), np.uint8)
+        if self._rgb_size is not None:
+            channels["rgb"] = spaces.Box(0, 255, (*(self._size or self._rgb_size), 3), np.uint8)
         if self._snapshots is not None:
             self._width = (len(self._snapshots.take(self._env)[0]),)
-        more = self._adapter
-        channels |= {at: channel.space for at, channel in more.channels.items() if channel.space is not None}
+        adapter = self._adapter
+        channels |= {at: channel.space for at, channel in adapter.channels.items() if channel.space is not None}
         what = f"the Gymnasium environment {self._name.removeprefix('gym:')}"
         return Spec(
             name=self._name,
             action=self._env.action_space,
             channels=channels,
             observes=(),
-            dt_s=(dt_s or told.dt_s) * self._repeat,
-            units={name: channel.unit for name, channel in more.channels.items() if channel.unit},
-            cameras=more.cameras,
-            action_names=told.names,
-            action_units=more.action_units,
-            action_mode=more.action_mode,
-            action_frame=more.action_frame,
-            keys=more.keys if more.keys is not None else told.keys,
+            dt_s=(dt_s or facts.dt_s) * self._repeat,
+            units={name: channel.unit for name, channel in adapter.channels.items() if channel.unit},
+            cameras=adapter.cameras,
+            action_names=facts.names,
+            action_units=adapter.action_units,
+            action_mode=adapter.action_mode,
+            action_frame=adapter.action_frame,
+            keys=adapter.keys if adapter.keys is not None else facts.keys,
             forkable=self._snapshots is not None,
-            max_batch=None if self._snapshots is not None else MOST,
-            card={"what": what, "kind": "simulator", "how": told.how},
-            idle=tuple(more.idle),
+            max_batch=None if self._snapshots is not None else MAX_EPISODES,
+            card={"what": what, "kind": "simulator", "how": facts.how},
+            idle=tuple(adapter.idle),
         )
 
 
@@ -355,7 +356,7 @@ def _seeds(count: int, rng: torch.Generator) -> list[int]:
 
 
 def _reseed(env: gymnasium.Env, seed: int) -> None:
-    """Sets PCG64's 128 bits directly: a tenth of the cost of a new generator, and it is done at every step."""
+    """Sets PCG64's 128 bits directly, which is done at every step: ten times faster than a new generator."""
     bits = env.unwrapped.np_random.bit_generator
     if not isinstance(bits, np.random.PCG64):
         raise NotCopyable(f"its random generator is a {type(bits).__name__}")
@@ -364,7 +365,7 @@ def _reseed(env: gymnasium.Env, seed: int) -> None:
 
 
 def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> tuple[Any, str]:
-    """Snapshots, if `twin`, put before every step to where `env` is, lives the same life; else None and why not."""
+    """(snapshots, "") if `twin`, set to the state of `env` before every step, steps identically; else (None, why not)."""
     actions = Spec("trial", env.action_space, {}, (), 1.0)
     rng = make_rng(0)
     try:
@@ -372,37 +373,37 @@ def _try_copying(env: gymnasium.Env, twin: gymnasium.Env, copier: Callable) -> t
         for seed in range(_TRIALS):
             env.reset(seed=seed)
             for action in actions.sample_action(_TRIAL_STEPS, rng).numpy():
-                twin.reset(seed=seed + _TRIALS)  # a detour, so that what the snapshot misses cannot agree by chance
+                twin.reset(seed=seed + _TRIALS)  # a detour, so that state missed by the snapshot differs
                 twin.step(action)
                 snapshots.put(twin, *snapshots.take(env))
-                lives = []
+                results = []
                 for each in (env, twin):
                     _reseed(each, seed)
                     seen, reward, terminated, truncated, _ = each.step(action)
-                    lives.append((_bytes(seen), reward, terminated, truncated, snapshots.take(each)))
-                if lives[0] != lives[1]:
-                    return None, "a copy of it does not live the same life"
+                    results.append((_bytes(seen), reward, terminated, truncated, snapshots.take(each)))
+                if results[0] != results[1]:
+                    return None, "a copy of it does not step identically"
                 if terminated or truncated:
                     break
     except NotCopyable as error:
         return None, str(error)
-    except Exception as error:  # its own, or that of a copy by halves: what is played alone will tell
+    except Exception as error:  # its own, or that of an incomplete copy
         return None, f"a trial of it ended with {type(error).__name__}: {error}"
     return snapshots, ""
 
 
 def _bytes(seen: Any) -> Any:
-    """An observation as what can be compared."""
+    """An observation in a form that can be compared."""
     if isinstance(seen, Mapping):
         return [(key, _bytes(value)) for key, value in seen.items()]
     return np.asarray(seen).tobytes()
 
 
 def check_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
-    """The size of a picture, if it can be one; else TerrellaError."""
+    """The size if it is a valid picture size; else TerrellaError."""
     if size is None:
         return None
-    sound = len(size) == 2 and all(int(side) == side and 1 <= side <= 4096 for side in size)
-    if not sound:
-        raise TerrellaError(f"a picture of {tuple(size)} pixels cannot be: size is (height, width), 1 to 4096 each.")
+    valid = len(size) == 2 and all(int(side) == side and 1 <= side <= 4096 for side in size)
+    if not valid:
+        raise TerrellaError(f"{tuple(size)} is not a picture size: size is (height, width), 1 to 4096 each.")
     return int(size[0]), int(size[1])

@@ -1,4 +1,4 @@
-"""The art of the Islet (sim/islet.py): its palette, its sprites, and the island, painted once."""
+"""The art of Islet (sim/islet.py): its palette, sprites and island, painted once."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _COLOURS = {
     "W": "fdfaf0", "G": "ccd1d0", "h": "949ca8", "H": "626879", "i": "f4a9c3", "I": "d8769f", "j": "fcd8e1",
     "v": "9b6fc6", "n": "f5c697", "u": "4569c9",
 }  # fmt: skip
-LETTERS = "." + "".join(_COLOURS)  # a letter's place is its index; 0 is see-through
+LETTERS = "." + "".join(_COLOURS)  # a letter's position is its palette index; 0 is transparent
 PALETTE = np.array(
     [[0, 0, 0], *([int(one[at : at + 2], 16) for at in (0, 2, 4)] for one in _COLOURS.values())], np.uint8
 )
 
-# Sprites stand side by side, a blank column apart.
+# Sprites are side by side, separated by a blank column.
 _WALKER = """
 .rrrrrr. .rrrrrr. .rrrrrr. .rrrrrr. .rrrrrr. .rrrrrr. .rrrrr.. .rrrrr.. .rrrrr..
 rrrrrrrr rrrrrrrr rrrrrrrr rrrrrrrr rrrrrrrr rrrrrrrr rrrrrrr. rrrrrrr. rrrrrrr.
@@ -96,18 +96,18 @@ RRRRRRRRRRRRRRRRRRRRRRRR ..WWWWWWWWWWGG.. ...rrrrrRR.. .b......B. .......b......
 
 
 def _cut(sheet: str, outline: str, swap: str = "") -> list[np.ndarray]:
-    """Its sprites [h, w] of indices, in an outline; `swap` holds the colours of the digits."""
+    """The sprites of a sheet, palette indices [h, w], with an outline; `swap` has the colours of the digits."""
     for digit, letter in enumerate(swap, 1):
         sheet = sheet.replace(str(digit), letter)
     rows = sheet.strip("\n").split("\n")
     columns = np.array([list(row) for row in rows]).T
     ends = [-1, *np.flatnonzero((columns == " ").all(1)), len(columns)]
-    found = []
+    sprites = []
     for left, right in zip(ends, ends[1:]):
         part = np.array([[max(LETTERS.find(one), 0) for one in row] for row in columns[left + 1 : right].T], np.uint8)
         full = np.flatnonzero(part.any(1))
-        found.append(_outlined(part[full[0] : full[-1] + 1], outline))
-    return found
+        sprites.append(_outlined(part[full[0] : full[-1] + 1], outline))
+    return sprites
 
 
 def _outlined(part: np.ndarray, letter: str) -> np.ndarray:
@@ -116,8 +116,8 @@ def _outlined(part: np.ndarray, letter: str) -> np.ndarray:
     part = np.pad(part, 1)
     near = np.zeros(part.shape, bool)
     for axis in (0, 1):
-        for way in (-1, 1):
-            near |= np.roll(part, way, axis) > 0
+        for shift in (-1, 1):
+            near |= np.roll(part, shift, axis) > 0
     return np.where((part == 0) & near, LETTERS.index(letter), part).astype(np.uint8)
 
 
@@ -127,16 +127,15 @@ def _both(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Art(NamedTuple):
-    """ground: uint8 [HEIGHT, WIDTH] of indices; base: int16, the row on which what is painted there stands (0: flat on the
-    ground); blocked: bool, where nobody can walk; the rest are sprites."""
+    """The painted island."""
 
-    ground: np.ndarray
-    base: np.ndarray
-    blocked: np.ndarray
+    ground: np.ndarray  # palette indices, uint8 [HEIGHT, WIDTH]
+    base: np.ndarray  # int16 [HEIGHT, WIDTH], the row of the foot of the thing painted there (0: flat on the ground)
+    blocked: np.ndarray  # bool [HEIGHT, WIDTH], not walkable
     sprites: dict[str, list]
 
 
-# What stands where: its middle and its foot, pixels of the map.
+# Positions of things: the middle of the foot, pixels of the map.
 _FIRS = (
     "150,52 164,46 178,48 193,45 207,52 222,50 157,64 172,61 201,62 215,66 162,79 196,79 209,77 143,41 231,62 226,76"
 )
@@ -155,7 +154,7 @@ MILL, HUT = (72, 78), (152, 116)
 
 
 class _Canvas:
-    """The map while it is painted."""
+    """The map during painting."""
 
     def __init__(self):
         self.ground = np.full((HEIGHT, WIDTH), LETTERS.index("S"), np.uint8)
@@ -170,12 +169,12 @@ class _Canvas:
         """Bool [HEIGHT, WIDTH]: inside an ellipse of half axes `across` and `down`."""
         return np.hypot((self.x - x) / across, (self.y - y) / down) < 1
 
-    def stroke(self, ways: str, radius: float) -> np.ndarray:
-        """Bool [HEIGHT, WIDTH]: near curves "x,y x,y x,y" (start, control point, end), one after another by ";"."""
+    def stroke(self, curves: str, radius: float) -> np.ndarray:
+        """Bool [HEIGHT, WIDTH]: near curves "x,y x,y x,y" (start, control point, end), separated by ";"."""
         where, size = np.zeros((HEIGHT, WIDTH), bool), int(radius) + 2
         row, column = np.mgrid[-size : size + 1, -size : size + 1]
-        for way in ways.split(";"):
-            start, bend, end = _places(way)
+        for curve in curves.split(";"):
+            start, bend, end = _places(curve)
             for t in np.linspace(0, 1, 100):
                 x, y = (a * (1 - t) ** 2 + 2 * b * t * (1 - t) + c * t**2 for a, b, c in zip(start, bend, end))
                 left, top = int(x) - size, int(y) - size
@@ -185,7 +184,7 @@ class _Canvas:
         return where
 
     def stand(self, sprite: np.ndarray, x: int, y: int, foot: tuple[int, int] = (0, 0), shade: int = 0) -> None:
-        """Paints a sprite whose foot's middle is at (x, y); nobody walks through its foot, of half width and height `foot`."""
+        """Paints a sprite with the middle of its foot at (x, y) and blocks the foot, of half width and height `foot`."""
         high, wide = sprite.shape
         if shade:
             here = self.oval(x + 1, y, shade, shade * 0.45)
@@ -208,29 +207,29 @@ def paint() -> Art:
     """The island and its sprites."""
     walker, small, plain = _cut(_WALKER, "k"), _cut(_SMALL, "k"), _cut(_SMALL, "")
     sprites = {
-        "walker": [[_both(one) for one in walker[at : at + 3]] for at in (0, 3, 6)],  # seen from the front, back, side
+        "walker": [[_both(one) for one in walker[at : at + 3]] for at in (0, 3, 6)],  # front, back, side
         "cat": [_both(one) for one in small[:3]], "duck": _both(small[3]), "duckling": _both(small[4]),
         "sheep": [_both(one) for one in small[5:7]], "star": [small[7]], "lit": [plain[8]], "boat": _both(small[11]),
         "butterfly": plain[9:11], "puff": [plain[12]], "sails": [_sails(phase) for phase in range(4)],
     }  # fmt: skip
     canvas = _Canvas()
     _land(canvas)
-    _ways(canvas)
+    _water_and_paths(canvas)
     _gardens(canvas)
     _things(canvas)
     return Art(canvas.ground, canvas.base, canvas.blocked, sprites)
 
 
 def _sails(phase: int) -> np.ndarray:
-    """The four sails of the mill, turned by `phase` quarters of a right angle."""
+    """The four sails of the mill, rotated by `phase` quarters of a right angle."""
     y, x = np.mgrid[-13:14, -13:14]
-    found = np.zeros((27, 27), np.uint8)
+    sprite = np.zeros((27, 27), np.uint8)
     for arm in range(4):
         angle = (arm + phase / 4) * np.pi / 2
         along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
-        found[(along > 4) & (along < 13) & (across > 0.5) & (across < 4)] = LETTERS.index("W")
-        found[(along > 0) & (along < 13) & (np.abs(across) < 0.8)] = LETTERS.index("B")
-    return found
+        sprite[(along > 4) & (along < 13) & (across > 0.5) & (across < 4)] = LETTERS.index("W")
+        sprite[(along > 0) & (along < 13) & (np.abs(across) < 0.8)] = LETTERS.index("B")
+    return sprite
 
 
 def _land(canvas: _Canvas) -> None:
@@ -238,7 +237,7 @@ def _land(canvas: _Canvas) -> None:
     x, y = canvas.x - 160, canvas.y - 122
     angle = np.arctan2(y / 96, x / 140)
     wobble = 1 + 0.045 * np.sin(3 * angle + 0.6) + 0.035 * np.sin(5 * angle + 2) + 0.02 * np.sin(9 * angle)
-    inland = 105 * (1 - np.hypot(x / 140, y / 96) / wobble)  # pixels from the shore, about
+    inland = 105 * (1 - np.hypot(x / 140, y / 96) / wobble)  # approximate distance from the shore, pixels
     for column, row, radius in ((284, 70, 21), (284, 100, 24)):  # the lighthouse's cape
         inland = np.maximum(inland, radius - np.hypot(canvas.x - column, canvas.y - row))
     for least, letter in ((-15, "s"), (-7, "w"), (-2, "f"), (0, "Y"), (1.5, "y"), (9, "d"), (10.2, "g")):
@@ -265,7 +264,7 @@ def _land(canvas: _Canvas) -> None:
         canvas.fill(meadow & canvas.oval(x, y, across, down), "l")
 
 
-def _ways(canvas: _Canvas) -> None:
+def _water_and_paths(canvas: _Canvas) -> None:
     """Pond, stream and paths."""
     x, y, across, down = POND
     stream = "254,136 280,138 276,150;276,150 272,166 318,164"
@@ -327,7 +326,7 @@ def _gardens(canvas: _Canvas) -> None:
 
 
 def _things(canvas: _Canvas) -> None:
-    """Trees, rocks, buildings, fences: the nearer ones over those behind."""
+    """Trees, rocks, buildings and fences, from back to front."""
     fir, round_tree, palm, bush = _cut(_PLANTS, "T", "tTd")[:4]
     cherry, rock, mushroom, menhir, castle = (
         _cut(_PLANTS, outline, "iIj")[at] for outline, at in (("R", 1), ("k", 4), ("k", 5), ("k", 6), ("B", 7))

@@ -1,4 +1,4 @@
-"""The compiled kernel of doom_map.py: a map of prisms seen from a place in it."""
+"""The compiled kernel of doom_map.py: depth of a map of prisms from a camera."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ import numpy as np
 def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthest, depth, sector):
     """Fills `depth` [H, W] and `sector` int32 [H, W] of the view from x, y and height z along `yaw` (radians).
 
-    lines [N, 4] = x1, y1, x2, y2, sector by sector: those of sector s are rows first[s] to first[s + 1]; solid [N] where
-    nothing is behind; heights [S, 2] = floor, ceiling; sky [S] where the ceiling is the open sky. Depth is along the optical
-    axis, in the units of the map, `farthest` at most and for the sky. `sector` is that whose floor, ceiling or edge is seen,
-    -1 for a solid wall and the sky.
+    lines [N, 4] = x1, y1, x2, y2; rows first[s] to first[s + 1] belong to sector s. solid [N]: walls. heights [S, 2]: floor,
+    ceiling. sky [S]: the ceiling is open sky. Depth is along the optical axis, in map units, `farthest` at most and for the sky.
+    `sector` is the one whose floor, ceiling or edge is seen, -1 for walls and the sky.
     """
     rows, columns = depth.shape
     fx, fy, cx, cy = camera
@@ -25,7 +24,7 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthes
         for end in range(2):
             px, py = lines[n, 2 * end] - x, lines[n, 2 * end + 1] - y
             ahead[n, end], right[n, end] = px * cosine + py * sine, px * sine - py * cosine
-    near = np.zeros(len(first) - 1, np.bool_)  # sectors of which a line lies before the camera
+    near = np.zeros(len(first) - 1, np.bool_)  # sectors with a line in front of the camera
     for s in range(len(near)):
         for n in range(first[s], first[s + 1]):
             near[s] |= max(ahead[n, 0], ahead[n, 1]) > 0 and min(ahead[n, 0], ahead[n, 1]) < farthest
@@ -51,7 +50,7 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthes
                 if enter >= wall:
                     break
                 for v in range(rows):
-                    # where the ray enters: on the edge of a floor or ceiling, or between them
+                    # the ray enters at the edge of a floor or ceiling, or between them
                     high = z - down[v] * enter
                     if high <= floor or high >= ceiling:
                         hit = enter
@@ -67,8 +66,9 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthes
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sorted_cuts(ahead, right, low, high, side, cuts):
-    """Where a column, `side` to the right for each unit ahead, enters and leaves the sector of lines low to high, in turn, into
-    `cuts`; gives how many there are. One that stands in the sector enters at 0."""
+    """Fills `cuts` with the distances at which a column, `side` to the right per unit ahead, alternately enters and leaves the
+    sector of lines low to high; returns their number. A camera inside the sector enters at 0.
+    """
     count = 0
     for n in range(low, high):
         cut = crossing(ahead, right, n, side)
@@ -89,7 +89,7 @@ def sorted_cuts(ahead, right, low, high, side, cuts):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def crossing(ahead, right, n, side):
-    """How far ahead the vertical plane of a column, `side` to the right for each unit ahead, meets line n; inf where not."""
+    """Distance at which a column, `side` to the right per unit ahead, meets line n; inf if it does not."""
     a, b = right[n, 0] - side * ahead[n, 0], right[n, 1] - side * ahead[n, 1]
     if (a > 0) == (b > 0):
         return np.inf

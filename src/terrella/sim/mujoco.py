@@ -1,4 +1,4 @@
-"""The state of a Gymnasium environment over MuJoCo as plain numbers, and back: so that it can be planned in."""
+"""Snapshots of MuJoCo environments of Gymnasium, which make them forkable."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations, and gymnasium's Env does not declare `model` and `data`
@@ -13,12 +13,11 @@ import numpy as np
 
 from .snapshot import Snapshots
 
-_WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION  # all that the next step depends on, the solver's warm start too
+_WHOLE = mujoco.mjtState.mjSTATE_INTEGRATION  # everything that the next step depends on, with the solver's warm start
 
 
 class MujocoSnapshots(Snapshots):
-    """The attributes that `Snapshots` takes, and MuJoCo's integration state. What is derived from that (where bodies are) is
-    computed anew when it is put back."""
+    """The attributes of `Snapshots`, and MuJoCo's integration state. Derived quantities (body poses) are computed on restore."""
 
     ignored = Snapshots.ignored | {"model", "data", "mujoco_renderer", "_ezpickle_args", "_ezpickle_kwargs"}
 
@@ -38,4 +37,4 @@ class MujocoSnapshots(Snapshots):
         model, data = bare.model, bare.data
         mujoco.mj_setState(model, data, state, _WHOLE)
         mujoco.mj_forward(model, data)
-        mujoco.mj_setState(model, data, state, _WHOLE)  # which the pass forward has changed
+        mujoco.mj_setState(model, data, state, _WHOLE)  # mj_forward has changed it

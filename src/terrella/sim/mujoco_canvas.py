@@ -1,4 +1,4 @@
-"""Pictures of many MuJoCo worlds as tiles of one large one, which is read once; and models that are cheap to draw small."""
+"""Renders many MuJoCo worlds as tiles of one image, read at once; and simplifies models for small pictures."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -13,15 +13,15 @@ import numpy as np
 
 from .mujoco_model import mujoco
 
-TILES = 8  # a side: so many pictures are drawn before they are read
-SMALL = 128  # pixels a side up to which pictures are drawn plainly
-_SLICES, _STACKS = 12, 8  # of round things in small pictures
-_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # left out: they cost most of the time
-_WIDE_M, _GRID_M = 32.0, 0.5  # half of the width of a floor without end, and of its parts, which are lit each
+TILES = 8  # pictures per side of the tiled image
+SMALL = 128  # pixels per side up to which a picture is rendered in a simpler way
+_SLICES, _STACKS = 12, 8  # of round geoms in small pictures
+_PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # disabled: they take most of the time
+_WIDE_M, _GRID_M = 32.0, 0.5  # half width of an infinite floor, and size of its separately lit cells
 
 
 class Canvas:
-    """Draws worlds of one model in pictures of `size` (height, width), up to TILES x TILES of them before `read`."""
+    """Renders worlds of one model at `size` (height, width), up to TILES x TILES pictures before a `read`."""
 
     def __init__(self, model: Any, size: tuple[int, int]):
         self._gl: Any = None
@@ -34,21 +34,21 @@ class Canvas:
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene, self._eye = mujoco.MjvScene(model, 10_000), mujoco.MjvCamera()
-        self._eye.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._option, self._touched = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._scene, self._camera = mujoco.MjvScene(model, 10_000), mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
 
     @property
     def full(self) -> bool:
         return self._drawn == self._tiles**2
 
-    def draw(self, data: Any, camera: str, furnish: Callable[[Any], None]) -> None:
-        """Draws what the camera sees of a world, and what `furnish` adds to the scene, onto the next tile."""
+    def draw(self, data: Any, camera: str, decorate: Callable[[Any], None]) -> None:
+        """Renders a world onto the next tile, after `decorate` has changed the scene."""
         height, width = self._size
-        self._eye.fixedcamid = self._model.camera(camera).id
+        self._camera.fixedcamid = self._model.camera(camera).id
         every = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(self._model, data, self._option, self._touched, self._eye, every, self._scene)
-        furnish(self._scene)
+        mujoco.mjv_updateScene(self._model, data, self._option, self._perturb, self._camera, every, self._scene)
+        decorate(self._scene)
         for flag in _PLAIN:
             self._scene.flags[flag] = 0
         row, column = divmod(self._drawn, self._tiles)
@@ -57,22 +57,22 @@ class Canvas:
         self._drawn += 1
 
     def read(self) -> np.ndarray:
-        """uint8 [n, H, W, 3]: what was drawn since it was last read, in order."""
+        """uint8 [n, H, W, 3]: the pictures since the last `read`, in order."""
         height, width = self._size
         rows = -(-self._drawn // self._tiles)
         pixels = self._pixels[: rows * height]
         self._gl.make_current()
         mujoco.mjr_readPixels(pixels, None, mujoco.MjrRect(0, 0, pixels.shape[1], len(pixels)), self._context)
         tiles = pixels.reshape(rows, height, self._tiles, width, 3)[:, ::-1].transpose(0, 2, 1, 3, 4)
-        found = tiles.reshape(-1, height, width, 3)[: self._drawn]
+        pictures = tiles.reshape(-1, height, width, 3)[: self._drawn]
         self._drawn = 0
-        return np.ascontiguousarray(found)
+        return np.ascontiguousarray(pictures)
 
     def close(self) -> None:
         if self._gl is None:
             return
         gl, self._gl = self._gl, None
-        gl.make_current()  # else it would free what another canvas holds
+        gl.make_current()  # otherwise this would free the resources of another canvas
         self._context.free()
         gl.free()
 
@@ -82,8 +82,9 @@ class Canvas:
 
 
 def simplify(model: Any, size: tuple[int, int]) -> None:
-    """Makes a model cheap to draw in small pictures, in place: floors without end get one, for MuJoCo draws those many times as
-    slowly; meshes lose what is finer than a pixel; round things are made of fewer parts, and edges are not smoothed."""
+    """Makes a model cheap to render in small pictures, in place: infinite floors, which MuJoCo renders many times slower, become
+    finite; meshes lose details finer than a pixel; round geoms get fewer faces; there is no antialiasing.
+    """
     if max(size) > SMALL:
         return
     endless = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_size[:, :2] == 0).all(1)
@@ -96,8 +97,7 @@ def simplify(model: Any, size: tuple[int, int]) -> None:
 
 
 def _thin(model: Any, mesh: int, cell_m: float) -> None:
-    """Lets all vertices of a mesh in one cell be one of them; faces that then have no area, or are there already, are left out
-    (Rossignac & Borrel 1993)."""
+    """Merges the vertices of a mesh in each cell, and removes degenerate and duplicate faces (Rossignac & Borrel 1993)."""
     vertices = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
     where = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
     cells = np.floor(vertices / cell_m).astype(np.int64)

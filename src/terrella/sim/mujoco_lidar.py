@@ -1,4 +1,4 @@
-"""LiDAR by ray casting: how far it is, all around a site of a MuJoCo model that is named "lidar"."""
+"""LiDAR by ray casting around the site "lidar" of a MuJoCo model."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -11,12 +11,13 @@ import numpy as np
 
 from .mujoco_model import mujoco
 
-SITE, TALLEST = "lidar", np.radians(15.0)  # several rows look from so far below the level to so far above it
+SITE, MAX_ELEVATION = "lidar", np.radians(15.0)  # several rows span this angle below and above the horizontal
 
 
 class Lidar:
-    """rays: of a turn, or (rows, rays of a turn). range_m: what is further away is as far as this. The first ray looks along the
-    site's x, the next ones go round to its y. The body that carries the site is not seen."""
+    """rays: per turn, or (rows, rays per turn). range_m: the largest distance. The first ray points along the site's x axis, the
+    next ones turn towards its y axis. The body that carries the site is ignored.
+    """
 
     def __init__(self, model: mujoco.MjModel, rays: int | Sequence[int], range_m: float):
         shape = (rays,) if isinstance(rays, int) else tuple(rays)
@@ -24,22 +25,18 @@ class Lidar:
         self.shape, self.range_m, self._site = shape, range_m, model.site(SITE).id
         self._body = int(model.site_bodyid[self._site])
         turn = np.arange(columns) / columns * 2 * np.pi
-        lift = np.linspace(TALLEST, -TALLEST, rows)[:, None] if rows > 1 else np.zeros((1, 1))
+        lift = np.linspace(MAX_ELEVATION, -MAX_ELEVATION, rows)[:, None] if rows > 1 else np.zeros((1, 1))
         flat = np.stack([np.cos(lift) * np.cos(turn), np.cos(lift) * np.sin(turn), np.sin(lift) + 0 * turn], 2)
         self._rays = flat.reshape(-1, 3)
 
     def scan(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """float32 [rays] or [rows, rays], m, of a world whose bodies are in place."""
+        """Distances float32 [rays] or [rows, rays], m, after forward kinematics."""
         count = len(self._rays)
-        rays, found, geoms = (
-            self._rays @ data.site_xmat[self._site].reshape(3, 3).T,
-            np.empty(count),
-            np.empty(count, np.int32),
-        )
+        rays = self._rays @ data.site_xmat[self._site].reshape(3, 3).T
+        distances, geoms = np.empty(count), np.empty(count, np.int32)
         at = data.site_xpos[self._site]
         mujoco.mj_multiRay(
-            model, data, at, rays.ravel(), None, True, self._body, geoms, found, None, count, self.range_m
+            model, data, at, rays.ravel(), None, True, self._body, geoms, distances, None, count, self.range_m
         )
-        return (
-            np.where((geoms < 0) | (found > self.range_m), self.range_m, found).reshape(self.shape).astype(np.float32)
-        )
+        missed = (geoms < 0) | (distances > self.range_m)
+        return np.where(missed, self.range_m, distances).reshape(self.shape).astype(np.float32)

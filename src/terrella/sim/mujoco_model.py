@@ -1,4 +1,4 @@
-"""MJCF and URDF files as MuJoCo models that can be driven and seen: what a file leaves out (servos, a floor, a camera) is added."""
+"""Loads MJCF and URDF files as MuJoCo models, and adds missing servos, floor and camera."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -10,9 +10,7 @@ import sys
 from pathlib import Path
 
 if "MUJOCO_GL" not in os.environ and sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ["MUJOCO_GL"] = (
-        "egl"  # which mujoco reads when it is imported: without a display its own choice cannot draw
-    )
+    os.environ["MUJOCO_GL"] = "egl"  # read when mujoco is imported; its default cannot render without a display
 
 import mujoco
 import numpy as np
@@ -20,17 +18,14 @@ from mujoco import rollout as rollout
 
 from ..core.errors import TerrellaError
 
-SERVO_HZ, SERVO_DAMPING = (
-    3.0,
-    1.0,
-)  # natural frequency and damping ratio of the servos that a file without actuators gets
+SERVO_HZ, SERVO_DAMPING = 3.0, 1.0  # natural frequency and damping ratio of added servos
 FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
-_REACH = {True: 1.0, False: float(np.pi)}  # of a servo of a joint without limits: slides in m, hinges in rad
+_REACH = {True: 1.0, False: float(np.pi)}  # range of an added servo without joint limits: slides in m, hinges in rad
 
 
 def read(path: str | Path) -> mujoco.MjSpec:
-    """The MjSpec of an MJCF or URDF file. TerrellaError, one sentence, where it is missing or broken: it names element and line."""
+    """The MjSpec of an MJCF or URDF file. TerrellaError where it is missing or broken, with element and line."""
     path = Path(path)
     if not path.is_file():
         raise TerrellaError(f"there is no file {path}; give an MJCF (.xml) or a URDF (.urdf).")
@@ -41,7 +36,7 @@ def read(path: str | Path) -> mujoco.MjSpec:
 
 
 def compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
-    """The model of a spec; TerrellaError, one sentence, for what cannot be: it names the element, or the file that is missing."""
+    """The model of a spec. TerrellaError where it does not compile, with the element or the missing file."""
     try:
         return spec.compile()
     except (ValueError, RuntimeError) as error:
@@ -49,21 +44,22 @@ def compiled(spec: mujoco.MjSpec, name: str) -> mujoco.MjModel:
 
 
 def bare(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> mujoco.MjModel:
-    """The same model without what is only looked at, which is small and steps faster; as it is where that changes the physics."""
+    """The model without visual geoms, which is smaller and faster; unchanged where that would change the physics."""
     small = spec.copy()
     small.compiler.discardvisual = True
     try:
-        found = compiled(small, name)
+        reduced = compiled(small, name)
     except TerrellaError:
         return model
-    same = found.nbody == model.nbody and found.nq == model.nq and np.allclose(found.body_mass, model.body_mass)
-    return found if same and found.nsensordata == model.nsensordata else model
+    same = reduced.nbody == model.nbody and reduced.nq == model.nq and np.allclose(reduced.body_mass, model.body_mass)
+    return reduced if same and reduced.nsensordata == model.nsensordata else model
 
 
 def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
-    """Adds to `spec` what it lacks: a position servo for each joint where there is no actuator at all, a floor where the world is
-    empty, a camera that sees the whole."""
-    spec.compiler.discardvisual = False  # which URDF files ask for
+    """Adds missing parts to `spec`: a position servo for each joint if there are no actuators, a floor if the world is empty, and a
+    camera that shows the whole model if there is none.
+    """
+    spec.compiler.discardvisual = False  # URDF files set it
     if not spec.actuators and any(joint.type not in (FREE, BALL) for joint in spec.joints):
         _name_joints(spec)
         add_servos(spec, compiled(spec.copy(), name))
@@ -75,7 +71,7 @@ def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
 
 
 def add_floor(spec: mujoco.MjSpec, sky: bool = True) -> None:
-    """A chequered plane at height 0, named "floor", lit, and a sky where there is none."""
+    """Adds a chequered plane "floor" at height 0 with a light, and a sky if there is none."""
     texture = spec.add_texture(
         name="terrella_floor", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
         rgb1=[0.25, 0.3, 0.35], rgb2=[0.4, 0.45, 0.5], width=64, height=64,
@@ -95,7 +91,7 @@ def add_floor(spec: mujoco.MjSpec, sky: bool = True) -> None:
 
 
 def _name_joints(spec: mujoco.MjSpec) -> None:
-    """Names the joints without one "joint 1", "joint 2", ...: servos and their readers find them by name."""
+    """Names unnamed joints "joint 1", "joint 2", …, because servos refer to joints by name."""
     taken, number = {joint.name for joint in spec.joints}, 0
     for joint in spec.joints:
         while not joint.name:
@@ -104,7 +100,7 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
 
 
 def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """A position servo for each hinge and slide, as stiff as its inertia asks for."""
+    """Adds a position servo to each hinge and slide, with a stiffness for its inertia."""
     for joint in spec.joints:
         if joint.type in (FREE, BALL):
             continue
@@ -121,7 +117,7 @@ def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 
 def _add_camera(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """A camera named "view" that sees the whole model, and goes along with a body that moves freely."""
+    """Adds a camera "view" that shows the whole model, and tracks a free body."""
     free = next((joint.parent for joint in spec.joints if joint.type == FREE), None)
     far = 1.6 * max(float(model.stat.extent), 0.1)
     forward, right = np.array([-0.7, -0.55, -0.45]), np.array([-0.55, 0.7, 0.0])
@@ -136,6 +132,6 @@ def _add_camera(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
 
 
 def _sentence(error: Exception) -> str:
-    """MuJoCo's words on one line."""
+    """MuJoCo's message on one line."""
     words = " ".join(str(error).replace("XML Error:", "").replace("Error:", "").split()).rstrip(".")
     return f"{words or type(error).__name__}; mend the file."

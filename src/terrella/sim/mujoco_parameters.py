@@ -1,4 +1,4 @@
-"""What may differ from world to world of one MuJoCo model: masses, friction, gravity, ...; and the models that come of it."""
+"""Parameters that may differ between worlds of one MuJoCo model (masses, friction, gravity, …), and the changed models."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -22,21 +22,21 @@ Model = Any  # mujoco.MjModel
 
 @dataclass(frozen=True)
 class Parameter:
-    """One number of a world. nominal: as the file has it; low, high: within which the physics stays sound; unit: "x" where it
-    multiplies what the file says. change(model, file, value) sets it in a fresh copy of the file's model, after whatever else was
-    changed there; of what is only seen, in a model of which SEEN is as in the file."""
+    """One number of a world."""
 
-    nominal: float
-    low: float
+    nominal: float  # the file's value
+    low: float  # range in which the simulation is stable
     high: float
-    unit: str
-    what: str
+    unit: str  # "x" for a factor
+    what: str  # description
+    # change(model, file, value) sets the value in a copy of the file's model. Earlier changes of a physics parameter are kept; for
+    # a visual one (`seen`), the fields SEEN have been reset to the file's.
     change: Callable[[Model, Model, float], None]
-    seen: bool = False  # it changes pictures alone
+    seen: bool = False  # affects pictures only
 
 
 def _scaled(*fields: str, low: float, high: float, what: str) -> Parameter:
-    """Multiplies, whatever else did so before: `mass`, `mass.BODY` and `inertia` go together in any order."""
+    """A factor on the current values, so that `mass`, `mass.BODY` and `inertia` combine in any order."""
 
     def change(model: Model, file: Model, value: float) -> None:
         for name in fields:
@@ -46,7 +46,7 @@ def _scaled(*fields: str, low: float, high: float, what: str) -> Parameter:
 
 
 def _sliding(model: Model, file: Model, value: float) -> None:
-    """The coefficients of all geoms and of all pairs that a file tells."""
+    """Sliding friction of all geoms and of all explicit pairs."""
     model.geom_friction[:, 0] *= value
     model.pair_friction[:, :2] *= value
 
@@ -56,14 +56,14 @@ def _gravity(model: Model, file: Model, value: float) -> None:
 
 
 def _gains(model: Model, file: Model, value: float) -> None:
-    """Of servos: force = kp (ctrl - q) - kv v, of which kp is scaled; of motors: their gear."""
+    """Servos: kp in force = kp (ctrl - q) - kv v. Motors: their gain."""
     servo = file.actuator_biasprm[:, 1] < 0
     model.actuator_gainprm[:, 0] = value * file.actuator_gainprm[:, 0]
     model.actuator_biasprm[:, 1] = np.where(servo, value, 1.0) * file.actuator_biasprm[:, 1]
 
 
 def _stiff(model: Model, file: Model, value: float) -> None:
-    """Springs towards where the joint is built, of hinges and slides."""
+    """Springs of hinges and slides towards the reference position."""
     plain = file.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
     model.jnt_stiffness[:] = file.jnt_stiffness + value * plain
 
@@ -98,11 +98,11 @@ def _colour(axis: int) -> Parameter:
         for field in ("geom_rgba", "mat_rgba"):
             getattr(model, field)[:, axis] = np.clip(getattr(file, field)[:, axis] + value, 0, 1)
 
-    return Parameter(0.0, -1.0, 1.0, "", "added to this share of all colours", change, True)
+    return Parameter(0.0, -1.0, 1.0, "", "added to this channel of all colours", change, True)
 
 
 def _turned_camera(axis: int) -> Parameter:
-    """About an axis of its own: its right, its up, or the one along which it looks."""
+    """Rotation of the cameras about their own right, up or view axis."""
     own = np.eye(3)[axis]
 
     def change(model: Model, file: Model, value: float) -> None:
@@ -112,17 +112,17 @@ def _turned_camera(axis: int) -> Parameter:
             mujoco.mju_mulQuat(after, quat, turn)
             quat[:] = after
 
-    return Parameter(0.0, -0.5, 0.5, "rad", "turned about its own " + ("right", "up", "back")[axis], change, True)
+    return Parameter(0.0, -0.5, 0.5, "rad", "rotated about its own " + ("right", "up", "back")[axis], change, True)
 
 
 def _turned_lights(axis: int, reach: float, what: str) -> Parameter:
-    """Those that hang in the world, with where they shine to, about the middle of the model."""
+    """Rotation of the fixed lights, position and direction, about the centre of the model."""
     about = np.eye(3)[axis]
 
     def change(model: Model, file: Model, value: float) -> None:
         turn, after, middle = np.empty(4), np.empty(3), model.stat.center
         mujoco.mju_axisAngle2Quat(turn, about, value)
-        for at in _hung(model):
+        for at in _fixed_lights(model):
             mujoco.mju_rotVecQuat(after, model.light_pos[at] - middle, turn)
             model.light_pos[at] = middle + after
             mujoco.mju_rotVecQuat(after, model.light_dir[at], turn)
@@ -131,34 +131,34 @@ def _turned_lights(axis: int, reach: float, what: str) -> Parameter:
     return Parameter(0.0, -reach, reach, "rad", what, change, True)
 
 
-def _hung(model: Model) -> np.ndarray:
+def _fixed_lights(model: Model) -> np.ndarray:
     fixed = model.light_mode == int(mujoco.mjtCamLight.mjCAMLIGHT_FIXED)
     return np.flatnonzero(fixed & (model.light_bodyid == 0))
 
 
-def _dressed(high: float, what: str) -> Parameter:
-    """What is changed in the scene that is drawn, by sim/mujoco_appearance.py: the model stays as it is."""
+def _scene_parameter(high: float, what: str) -> Parameter:
+    """A change of the rendered scene, made by sim/mujoco_appearance.py; the model is unchanged."""
     return Parameter(0.0, 0.0, high, "", what, lambda model, file, value: None, True)
 
 
 SEEN = ("cam_pos", "cam_quat", "cam_fovy", "light_pos", "light_dir", "light_diffuse", "geom_rgba", "mat_rgba")
-TEXTURES = _dressed(1.0, "share of the surfaces that wear a texture; which ones and which, its digits tell")
-COLOURS = _dressed(1.0, "how far each surface's colour goes to one of its own; to which, its digits tell")
-DISTRACTORS = _dressed(20.0, "balls and boxes that stand about: how many, and after the point where and how they look")
+TEXTURES = _scene_parameter(1.0, "share of the surfaces with a random texture; the value's bits seed the choice")
+COLOURS = _scene_parameter(1.0, "blend of each surface's colour towards a random one; the value's bits seed the choice")
+DISTRACTORS = _scene_parameter(20.0, "number of added balls and boxes; the value's bits seed their places and colours")
 
 
 def parameters_of(model: Model) -> Mapping[str, Parameter]:
-    """What may be changed of a model, by name; `mass.NAME` is that of one body."""
+    """The parameters of a model, by name; `mass.NAME` is that of one body."""
     gravity = -float(model.opt.gravity[2])
-    found = {
+    parameters = {
         "mass": _scaled("body_mass", "body_inertia", low=0.3, high=3.0, what="mass and inertia of all bodies"),
-        "inertia": _scaled("body_inertia", low=0.5, high=2.0, what="inertia of all bodies, their mass as it is"),
+        "inertia": _scaled("body_inertia", low=0.5, high=2.0, what="inertia of all bodies, at the same mass"),
         "friction": Parameter(1.0, 0.05, 3.0, "x", "sliding friction", _sliding),
         "gravity": Parameter(gravity, 0.0, 30.0, "m/s²", "downwards", _gravity),
         "damping": _scaled("dof_damping", low=0.0, high=10.0, what="damping of the joints"),
         "armature": _scaled("dof_armature", low=0.2, high=5.0, what="rotor inertia of the joints"),
         "joint_friction": _scaled("dof_frictionloss", low=0.0, high=10.0, what="dry friction of the joints"),
-        "spring": Parameter(0.0, 0.0, 100.0, "N m/rad or N/m", "springs in the joints, towards 0, beside the file's", _stiff),
+        "spring": Parameter(0.0, 0.0, 100.0, "N m/rad or N/m", "springs in the joints towards 0, added to the file's", _stiff),
         "gain": Parameter(1.0, 0.3, 2.0, "x", "gain of the servos, or force of the motors", _gains),
         "strength": _scaled("actuator_forcerange", low=0.1, high=2.0, what="limit of the actuators' forces"),
         "camera.x": _camera("cam_pos", 0, 1.0, "m", "moved along its body's x"),
@@ -167,26 +167,26 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "camera.fov": _camera("cam_fovy", None, 0.0, "x", "field of view"),
         "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
         "camera.pitch": _turned_camera(0), "camera.yaw": _turned_camera(1), "camera.roll": _turned_camera(2),
-        "light.turn": _turned_lights(2, float(np.pi), "the lights, about the vertical"),
-        "light.tilt": _turned_lights(0, 0.8, "the lights, about the world's x"),
+        "light.turn": _turned_lights(2, float(np.pi), "rotation of the lights about the vertical"),
+        "light.tilt": _turned_lights(0, 0.8, "rotation of the lights about the world's x"),
         "red": _colour(0), "green": _colour(1), "blue": _colour(2),
         "textures": TEXTURES, "colours": COLOURS, "distractors": DISTRACTORS,
     }  # fmt: skip
-    acts = {
+    fields = {
         "damping": "dof_damping", "armature": "dof_armature", "joint_friction": "dof_frictionloss",
         "strength": "actuator_forcerange", "gain": "actuator_gainprm",
     }  # fmt: skip
-    for name, field in acts.items():
-        if not np.any(getattr(model, field)):  # twice nothing is nothing
-            del found[name]
-    if not _hung(model).size:
-        del found["light.turn"], found["light.tilt"]
+    for name, field in fields.items():
+        if not np.any(getattr(model, field)):  # a factor on zeros has no effect
+            del parameters[name]
+    if not _fixed_lights(model).size:
+        del parameters["light.turn"], parameters["light.tilt"]
     bodies = {model.body(at).name: at for at in range(1, model.nbody) if model.body_mass[at] > 0}
-    return found | {f"mass.{name}": _one_mass(at) for name, at in bodies.items() if name}
+    return parameters | {f"mass.{name}": _one_mass(at) for name, at in bodies.items() if name}
 
 
 def checked(known: Mapping[str, Parameter], names: Sequence[str]) -> None:
-    """TerrellaError for names that there are not."""
+    """TerrellaError for unknown names."""
     for name in names:
         if name not in known:
             plain = [one for one in known if not one.startswith("mass.")]
@@ -197,19 +197,19 @@ def checked(known: Mapping[str, Parameter], names: Sequence[str]) -> None:
 
 
 class Models:
-    """Models of the worlds of a batch: one for each row of values, made once and kept while it is used."""
+    """The models of the worlds of a batch: one per row of values, cached."""
 
     def __init__(self, file: Model, changes: Sequence[Parameter]):
         self.file, self.changes = file, tuple(changes)
         self._made: OrderedDict[bytes, Model] = OrderedDict()
-        self._most = 0  # rows of the largest batch: what looks at its worlds one by one leaves their models here
+        self._most = 0  # rows of the largest batch, whose models must stay in the cache
         self._data = mujoco.MjData(file)
 
     def of(self, values: np.ndarray) -> list[Model]:
-        """values: float64 [B, parameters]; the models stay as they are for as long as somebody holds them."""
+        """The models for values float64 [B, parameters]. A returned model never changes."""
         if not self.changes:
             return [self.file] * len(values)
-        found = []
+        models = []
         for row in values:
             key = row.tobytes()
             model = self._made.get(key)
@@ -217,14 +217,14 @@ class Models:
                 model = self._made[key] = self.changed(copy.copy(self.file), row)
             else:
                 self._made.move_to_end(key)
-            found.append(model)
+            models.append(model)
         self._most = max(self._most, len(values))
         while len(self._made) > 2 * self._most + 64:
             self._made.popitem(last=False)
-        return found
+        return models
 
     def changed(self, model: Model, row: np.ndarray) -> Model:
-        """The model with the values of one world, and what MuJoCo derives from them."""
+        """Applies the values of one world to a model, and updates what MuJoCo derives from them."""
         for change, value in zip(self.changes, row.tolist()):
             change.change(model, self.file, value)
         mujoco.mj_setConst(model, self._data)

@@ -1,4 +1,4 @@
-"""The autopilot of a multirotor: thrusts from the velocities that a person, or a policy, asks for."""
+"""The autopilot of a multirotor: thrusts from commanded velocities."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from .mujoco_model import mujoco
-from .mujoco_tasks import RobotLayout, motion, rotated
+from .mujoco_tasks import RobotLayout, motion, rotate
 
 VELOCITY, CLIMB, LEVEL, TURN = 2.0, 4.0, (60.0, 14.0), 6.0  # gains, 1/s, 1/s, (1/s², 1/s), 1/s
-PUSH, LIFT = 4.0, 6.0  # m/s² that are asked for at most: a tilt of 22 degrees
+MAX_PUSH, MAX_LIFT = 4.0, 6.0  # m/s²; a tilt of 22 degrees
 
 
 class Multirotor:
@@ -30,7 +30,7 @@ class Multirotor:
     }  # fmt: skip
 
     def __init__(self, model: mujoco.MjModel):
-        """model: of one free robot, whose actuators are thrusts at sites."""
+        """model: one free body whose actuators are thrusts at sites."""
         sites = model.actuator_trnid[:, 0]
         place, gear = model.site_pos[sites] - model.body_ipos[1], model.actuator_gear
         wrench = np.stack(
@@ -40,23 +40,23 @@ class Multirotor:
         self._mass, self._inertia = float(model.body_mass[1]), torch.from_numpy(model.body_inertia[1].copy())
         self._gravity = -float(model.opt.gravity[2])
 
-    def __call__(self, robot: RobotLayout, physics: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Thrusts [B, rotors] in N of physics [B, n] and actions [B, 4]."""
-        velocity, spin, up = motion(robot, physics)
-        turn = physics[:, robot.qpos][:, 3:7]
+    def __call__(self, layout: RobotLayout, physics: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Thrusts [B, rotors] in N from physics [B, n] and actions [B, 4]."""
+        velocity, spin, up = motion(layout, physics)
+        turn = physics[:, layout.qpos][:, 3:7]
         w, x, y, z = turn.unbind(1)
         heading = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         half = torch.stack([(heading / 2).cos(), 0 * w, 0 * w, -(heading / 2).sin()], 1)
-        level = rotated(half, physics[:, robot.qvel][:, :3])  # in the frame that turns with the body alone
-        push = (VELOCITY * (action[:, :2] - level[:, :2])).clamp(-PUSH, PUSH)
-        lift = self._gravity + (CLIMB * (action[:, 2] - level[:, 2])).clamp(-LIFT, LIFT)
+        level = rotate(half, physics[:, layout.qvel][:, :3])  # in the frame that turns with the body alone
+        push = (VELOCITY * (action[:, :2] - level[:, :2])).clamp(-MAX_PUSH, MAX_PUSH)
+        lift = self._gravity + (CLIMB * (action[:, 2] - level[:, 2])).clamp(-MAX_LIFT, MAX_LIFT)
         wanted = torch.cat([push, torch.full_like(lift, self._gravity)[:, None]], 1)
-        wanted = rotated(
-            turn * turn.new_tensor([1, -1, -1, -1]), rotated(half * half.new_tensor([1, -1, -1, -1]), wanted)
+        wanted = rotate(
+            turn * turn.new_tensor([1, -1, -1, -1]), rotate(half * half.new_tensor([1, -1, -1, -1]), wanted)
         )
         wanted = wanted / wanted.norm(dim=1, keepdim=True)  # where up should point, in the body's frame
         torque = LEVEL[0] * torch.stack([-wanted[:, 1], wanted[:, 0], 0 * w], 1) - LEVEL[1] * spin
         torque[:, 2] = TURN * (action[:, 3] - spin[:, 2])
         thrust = self._mass * lift / up[:, 2].clamp_min(0.5)
-        asked = torch.cat([thrust[:, None], torque * self._inertia], 1) @ self._mix.T
-        return asked.clamp(robot.low, robot.high)
+        thrusts = torch.cat([thrust[:, None], torque * self._inertia], 1) @ self._mix.T
+        return thrusts.clamp(layout.low, layout.high)

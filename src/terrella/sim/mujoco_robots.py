@@ -1,4 +1,4 @@
-"""Robots that are ready to use: files that lie inside wheels, with servos, a pose to start from and a task."""
+"""Ready robots: model files inside wheels, with servos, a rest pose and a task."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -22,7 +22,7 @@ from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracki
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
 OWN = "terrella/sim/models/"
-_INSTALL = {  # mjlab itself pins another mujoco, and only its files are wanted
+_INSTALL = {  # only mjlab's files are needed, and it pins another mujoco
     "mjlab": "pip install --no-deps mjlab==1.6.0",
     "gymnasium": "pip install gymnasium",
 }
@@ -30,53 +30,48 @@ _INSTALL = {  # mjlab itself pins another mujoco, and only its files are wanted
 
 @dataclass(frozen=True)
 class Servo:
-    """Position servos of joints. stiffness in N m/rad (N/m of slides), damping in N m s/rad, limit in N m, armature in kg m²;
-    reach: how far from the pose at rest a command may be, rad (m)."""
+    """A position servo. Units are those of hinges; slides have m for rad and N for N m."""
 
-    stiffness: float
-    damping: float
-    limit: float
-    armature: float
-    reach: float
+    stiffness: float  # N m/rad
+    damping: float  # N m s/rad
+    limit: float  # N m
+    armature: float  # kg m²
+    reach: float  # largest command from the rest pose, rad
 
 
 @dataclass(frozen=True)
 class Robot:
-    """file: inside a wheel, PACKAGE/PATH; servos: by pattern of a joint's name, the first that fits; height: of the free body at
-    rest, m; pose: of the joints at rest, by pattern; still: hinges that are held in it, by pattern; touching: geoms that collide,
-    by pattern, all where it is ""; adds: what the spec gets besides; step_s, control_s: seconds of a step of physics and of
-    control; keys, units: of its actions, where the file does not say; pilot: makes controls of actions, in place of a person who
-    cannot; sky: whether it is drawn under one."""
+    """A ready robot. Patterns are regular expressions of joint or geom names; the first match counts."""
 
-    file: str
-    what: str
+    file: str  # inside a wheel, PACKAGE/PATH
+    what: str  # description
     task: RobotTask = field(default_factory=Free)
-    servos: Mapping[str, Servo] = field(default_factory=dict)
-    height: float | None = None
-    pose: Mapping[str, float] = field(default_factory=dict)
-    still: str = ""
-    touching: str = ""
-    adds: Callable[[mujoco.MjSpec], None] = lambda spec: None
-    step_s: float | None = None
+    servos: Mapping[str, Servo] = field(default_factory=dict)  # pattern of joints -> servo
+    height: float | None = None  # of the free body at rest, m
+    pose: Mapping[str, float] = field(default_factory=dict)  # pattern of joints -> position at rest
+    still: str = ""  # pattern of hinges that are fixed at rest
+    touching: str = ""  # pattern of geoms that collide, with the floor only; "" for no change
+    adds: Callable[[mujoco.MjSpec], None] = lambda spec: None  # further changes of the spec
+    step_s: float | None = None  # of physics; default: the file's
     control_s: float = 0.02
     max_steps: int | None = None
-    keys: Mapping[str, list[float]] = field(default_factory=dict)
-    units: tuple[str, ...] = ()
-    pilot: type[Multirotor] | None = None
-    sky: bool = True
+    keys: Mapping[str, list[float]] = field(default_factory=dict)  # as in Spec
+    units: tuple[str, ...] = ()  # of actions, where the file does not define them
+    pilot: type[Multirotor] | None = None  # turns actions into controls
+    sky: bool = True  # whether a sky is added with the floor
 
     def spec(self, name: str) -> mujoco.MjSpec:
-        """The robot's file with what is added to it. TerrellaError where the wheel is not installed."""
+        """The robot's spec with all additions. TerrellaError where the wheel is not installed."""
         spec = read(path_of(self.file, name))
         if self.step_s is not None:
             spec.option.timestep = self.step_s
         if self.touching:
-            self._touch(spec)
+            self._limit_collisions(spec)
         for joint in [one for one in spec.joints if re.fullmatch(self.still, one.name)] if self.still else ():
-            self._hold(spec, joint)
+            self._fix(spec, joint)
         if self.servos:
             for joint in spec.joints:
-                self._drive(spec, joint)
+                self._add_servo(spec, joint)
         if not any(geom.type == mujoco.mjtGeom.mjGEOM_PLANE for geom in spec.geoms):
             add_floor(spec, self.sky)
             if self.touching:
@@ -85,21 +80,19 @@ class Robot:
         return spec
 
     def rest(self, joint: str) -> float:
-        """The angle (or way) of a joint at rest."""
+        """The position of a joint at rest, rad or m."""
         return next((value for pattern, value in self.pose.items() if re.fullmatch(pattern, joint)), 0.0)
 
-    def _touch(self, spec: mujoco.MjSpec) -> None:
-        """Only the named geoms collide, and only with the floor."""
+    def _limit_collisions(self, spec: mujoco.MjSpec) -> None:
+        """Lets only the named geoms collide, and only with the floor."""
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = (
-                0,
-                int(bool(geom.name) and re.fullmatch(self.touching, geom.name) is not None),
-            )
+            collides = bool(geom.name) and re.fullmatch(self.touching, geom.name) is not None
+            geom.contype, geom.conaffinity = 0, int(collides)
             if geom.conaffinity:
                 geom.condim, geom.priority, geom.friction = 3, 1, [0.8, 0.02, 0.01]
 
-    def _hold(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
-        """A hinge becomes part of its body, turned as it is at rest; what drives it goes."""
+    def _fix(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
+        """Replaces a hinge by a fixed rotation at rest, and removes its actuators."""
         turn, turned, at, about = np.empty(4), np.empty(4), np.empty(3), np.asarray(joint.pos, np.float64)
         body = joint.parent
         mujoco.mju_axisAngle2Quat(turn, np.asarray(joint.axis, np.float64), self.rest(joint.name))
@@ -111,7 +104,7 @@ class Robot:
             spec.delete(driver)
         spec.delete(joint)
 
-    def _drive(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
+    def _add_servo(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> None:
         servo = next((one for pattern, one in self.servos.items() if re.fullmatch(pattern, joint.name)), None)
         if servo is None or joint.type == FREE:
             return
@@ -124,14 +117,14 @@ class Robot:
 
 
 def _feet(*sites: str, size: float = 0.03, moving: bool = False) -> Callable[[mujoco.MjSpec], None]:
-    """Sensors of these sites: the force, in N, on the geoms that lie within `size` m of them; where and how fast they are."""
+    """Adds sensors to these sites: contact force, N, within `size` m; if `moving`, position and velocity."""
     kinds = {"foot": mujoco.mjtSensor.mjSENS_TOUCH}
     if moving:
         kinds |= {"place": mujoco.mjtSensor.mjSENS_FRAMEPOS, "speed": mujoco.mjtSensor.mjSENS_FRAMELINVEL}
 
     def add(spec: mujoco.MjSpec) -> None:
         for site in sites:
-            spec.site(site).size = [size] * 3  # a little larger than the foot: what touches is inside
+            spec.site(site).size = [size] * 3  # slightly larger than the foot, so that its contacts are inside
             for kind, sensor in kinds.items():
                 spec.add_sensor(name=f"{kind}_{site}", type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site)
 
@@ -139,7 +132,7 @@ def _feet(*sites: str, size: float = 0.03, moving: bool = False) -> Callable[[mu
 
 
 def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
-    """The arm stands on a table, with three blocks on it; a sensor tells where its hand is."""
+    """Puts the arm on a table with three blocks, and adds a sensor of its hand's position."""
 
     def add(spec: mujoco.MjSpec) -> None:
         box = mujoco.mjtGeom.mjGEOM_BOX
@@ -161,9 +154,13 @@ def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
             block.add_geom(
                 type=box, size=[0.02] * 3, rgba=[*colour, 1], mass=0.05, friction=[1.5, 0.02, 0.001], condim=4
             )
-        seen = spec.camera("front_cam")
-        seen.pos, seen.alt.type, seen.alt.xyaxes = [1.15, -0.75, 0.7], mujoco.mjtOrientation.mjORIENTATION_XYAXES, _LOOK
-        seen.fovy = 50
+        camera = spec.camera("front_cam")
+        camera.pos, camera.alt.type, camera.alt.xyaxes = (
+            [1.15, -0.75, 0.7],
+            mujoco.mjtOrientation.mjORIENTATION_XYAXES,
+            _LOOK,
+        )
+        camera.fovy = 50
         spec.add_sensor(
             name="hand", type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=site
         )
@@ -171,14 +168,14 @@ def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
     return add
 
 
-TABLE_M = 0.75  # height of the table on which the arm stands
-_LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # of its camera
+TABLE_M = 0.75  # height of the arm's table
+_LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # axes of its camera
 _LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)
 _BODY = Servo(100.0, 5.0, 88.0, 0.01, 0.6)
 ROBOTS: Mapping[str, Robot] = {
     "go1": Robot(
         ZOO + "unitree_go1/xmls/go1.xml",
-        "Unitree Go1, a quadruped that trots with a commanded velocity",
+        "Unitree Go1, a quadruped that trots at a commanded velocity",
         Stepping(
             feet={"FR": 0.0, "RL": 0.0, "FL": 0.5, "RR": 0.5}, period_s=0.5, standing=0.5, lift_m=0.1, straight=(0, 3, 6, 9)
         ),
@@ -193,7 +190,7 @@ ROBOTS: Mapping[str, Robot] = {
     ),
     "g1": Robot(
         ZOO + "unitree_g1/xmls/g1.xml",
-        "Unitree G1, a humanoid that walks with a commanded velocity, its waist and arms held",
+        "Unitree G1, a humanoid that walks at a commanded velocity, with fixed waist and arms",
         Stepping(forward=(0.2, 0.8)),
         {
             ".*hip_(pitch|yaw).*": Servo(100.0, 2.0, 88.0, 0.01, 0.7),
@@ -214,7 +211,7 @@ ROBOTS: Mapping[str, Robot] = {
     ),
     "yam": Robot(
         ZOO + "i2rt_yam/xmls/yam.xml",
-        "I2RT YAM, an arm with a gripper on a table, that reaches for a point",
+        "I2RT YAM, an arm with a gripper on a table, that reaches a point",
         Reach(),
         {
             "joint[123]": Servo(40.0, 8.0, 28.0, 0.032, 1.5),
@@ -234,7 +231,7 @@ ROBOTS: Mapping[str, Robot] = {
     ),
     "car": Robot(
         OWN + "car.xml",
-        "a car of a tenth of the size, with LiDAR",
+        "a car at a tenth of its size, with LiDAR",
         keys={
             "ArrowLeft": [0.5, 0], "ArrowRight": [-0.5, 0], "ArrowUp": [0, 2.5], "ArrowDown": [0, -1],
             "KeyA": [0.5, 0], "KeyD": [-0.5, 0], "KeyW": [0, 2.5], "KeyS": [0, -1],
@@ -257,19 +254,19 @@ ROBOTS: Mapping[str, Robot] = {
 
 
 def path_of(file: str, name: str) -> Path:
-    """Where a file of a wheel lies, without importing the package. TerrellaError that tells how to install it."""
+    """The path of a file in a wheel, without importing its package. TerrellaError with the install command if it is missing."""
     package, _, inside = file.partition("/")
-    found = find_spec(package)
-    if found is None or not found.submodule_search_locations:
-        raise TerrellaError(f"the robot '{name}' lies in the package {package}: {_INSTALL[package]}.")
-    path = Path(next(iter(found.submodule_search_locations))) / inside
+    module = find_spec(package)
+    if module is None or not module.submodule_search_locations:
+        raise TerrellaError(f"the robot '{name}' is in the package {package}: {_INSTALL[package]}.")
+    path = Path(next(iter(module.submodule_search_locations))) / inside
     if not path.is_file():
         raise TerrellaError(f"the installed {package} has no {inside}; {_INSTALL[package]}.")
     return path
 
 
 def robot_of(name: str) -> Robot:
-    """A ready robot by its name; TerrellaError where there is none."""
+    """A ready robot by name; TerrellaError for an unknown name."""
     if name not in ROBOTS:
         likest = did_you_mean(name, ROBOTS) or "."
         raise TerrellaError(

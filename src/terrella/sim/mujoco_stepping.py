@@ -1,4 +1,4 @@
-"""Steps rows of physics with `mujoco.rollout`: pure functions of numbers, on threads, each row with a model of its own."""
+"""Steps batches of physics states with `mujoco.rollout`, on threads, each row with its own model."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -17,7 +17,7 @@ _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 class Stepper:
-    """Worlds of one model. `changes`: parameters by their column in the rows of values."""
+    """Worlds of one model. `changes`: the varying parameters, by their column in the values."""
 
     def __init__(self, file: mujoco.MjModel, changes: Mapping[int, Parameter], threads: int):
         self.file, self._columns = file, list(changes)
@@ -29,8 +29,9 @@ class Stepper:
     def step(
         self, physics: torch.Tensor, warmstart: torch.Tensor, ctrl: torch.Tensor, values: torch.Tensor, steps: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """`steps` steps from float64 physics [B, n], the solver's warmstart [B, nv] and controls [B, nu]: physics, what was sensed
-        at the beginning of the last step [B, sensors], and the next warmstart, by the acceleration over the last step."""
+        """`steps` steps from float64 physics [B, n], the solver's warmstart [B, nv] and controls [B, nu]. Returns the physics, the
+        sensors [B, n] at the start of the last step, and the next warmstart: the acceleration over the last step.
+        """
         batch, model = len(physics), self.file
         controls = ctrl[:, None].expand(batch, steps, model.nu).contiguous().numpy()
         states = np.empty((batch, steps, physics.shape[1]))
@@ -44,24 +45,26 @@ class Stepper:
         )  # fmt: skip
         velocity = slice(1 + model.nq, 1 + model.nq + model.nv)
         before = states[:, -2, velocity] if steps > 1 else physics.numpy()[:, velocity]
-        pushed = (states[:, -1, velocity] - before) / model.opt.timestep
-        return tuple(torch.from_numpy(np.ascontiguousarray(part)) for part in (states[:, -1], sensed[:, -1], pushed))  # pyright: ignore[reportReturnType]
+        acceleration = (states[:, -1, velocity] - before) / model.opt.timestep
+        return tuple(
+            torch.from_numpy(np.ascontiguousarray(part)) for part in (states[:, -1], sensed[:, -1], acceleration)
+        )  # pyright: ignore[reportReturnType]
 
     def contacts(self, physics: np.ndarray, ctrl: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """float32 [bodies]: the normal forces of the contacts of each body of one world, in N."""
+        """float32 [bodies]: the sum of the normal contact forces on each body of one world, N."""
         model, data = self._models.of(values[None, self._columns])[0], self._datas[0]
         mujoco.mj_setState(model, data, physics, _FULL)
         data.ctrl[:], data.qacc_warmstart[:] = ctrl, 0.0
         mujoco.mj_forward(model, data)
-        found, force = np.zeros(model.nbody, np.float32), np.zeros(6)
+        forces, force = np.zeros(model.nbody, np.float32), np.zeros(6)
         for at in range(data.ncon):
             mujoco.mj_contactForce(model, data, at, force)
             for geom in data.contact[at].geom:
-                found[model.geom_bodyid[geom]] += force[0]
-        return found
+                forces[model.geom_bodyid[geom]] += force[0]
+        return forces
 
-    def standing(self, physics: np.ndarray, values: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """The model of one world, with its bodies in place."""
+    def placed(self, physics: np.ndarray, values: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """The model and data of one world after forward kinematics."""
         model, data = self._models.of(values[None, self._columns])[0], self._datas[0]
         mujoco.mj_setState(model, data, physics, _FULL)
         mujoco.mj_kinematics(model, data)

@@ -1,4 +1,4 @@
-"""Steps rows of physics on a GPU with `mujoco-warp`, in the place of `mujoco.rollout`; see mujoco_stepping.py."""
+"""Steps batches of physics states on a GPU with `mujoco-warp` instead of `mujoco.rollout`; see mujoco_stepping.py."""
 
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 # mujoco-warp is an extra
@@ -15,9 +15,9 @@ from .mujoco_stepping import Stepper
 
 
 class WarpStepper(Stepper):
-    """Worlds of one model on one CUDA device, in float32; states are torch tensors of the CPU. What is asked for world by
-    world (contacts, LiDAR) stays with MuJoCo. Parameters cannot differ from world to world. TerrellaError without mujoco-warp or
-    a GPU."""
+    """Worlds of one model on one CUDA device, in float32; states are CPU tensors. Contacts and LiDAR, computed world by world, stay
+    with MuJoCo. Parameters cannot differ between worlds. TerrellaError without mujoco-warp or a GPU.
+    """
 
     def __init__(self, file: mujoco.MjModel, device: str):
         super().__init__(file, {}, 1)
@@ -25,17 +25,15 @@ class WarpStepper(Stepper):
             import mujoco_warp
             import warp
         except ImportError as error:
-            raise TerrellaError("MuJoCo's worlds step on a GPU by mujoco-warp: pip install mujoco-warp.") from error
+            raise TerrellaError("stepping MuJoCo on a GPU needs mujoco-warp: pip install mujoco-warp.") from error
         warp.init()
         if not warp.is_cuda_available():
-            raise TerrellaError(
-                "mujoco-warp finds no GPU with CUDA here; leave the device out, and MuJoCo steps on the CPU."
-            )
+            raise TerrellaError("mujoco-warp finds no CUDA GPU; leave `device` out to step on the CPU.")
         self._warp, self._mjw, self._device = warp, mujoco_warp, warp.get_device(device)
         with warp.ScopedDevice(self._device):
             self._model = mujoco_warp.put_model(file)
         self._held: dict[int, Any] = {}  # batch -> its data
-        self._graphs: dict[tuple[int, int], Any] = {}  # batch and steps -> what was captured
+        self._graphs: dict[tuple[int, int], Any] = {}  # (batch, steps) -> captured graph
 
     def step(
         self, physics: torch.Tensor, warmstart: torch.Tensor, ctrl: torch.Tensor, values: torch.Tensor, steps: int
@@ -68,14 +66,14 @@ class WarpStepper(Stepper):
         return self._held[batch]
 
     def _run(self, data: Any, batch: int, steps: int) -> None:
-        """`steps` steps as one CUDA graph, which is captured once."""
+        """Runs `steps` steps as one CUDA graph, captured at the first call."""
         key = batch, steps
         if key not in self._graphs:
             before = {
                 name: self._warp.clone(getattr(data, name))
                 for name in ("qpos", "qvel", "act", "time", "qacc_warmstart")
             }
-            self._mjw.step(self._model, data)  # compiles what a capture cannot
+            self._mjw.step(self._model, data)  # compiles kernels, which is not possible during a capture
             with self._warp.ScopedCapture() as capture:
                 for _ in range(steps):
                     self._mjw.step(self._model, data)

@@ -1,4 +1,4 @@
-"""MujocoWorld: thousands of worlds of one MuJoCo model in one State, stepped together by `mujoco.rollout` on threads of the CPU."""
+"""MujocoWorld: thousands of worlds of one MuJoCo model in one State, stepped in parallel by `mujoco.rollout` on CPU threads."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -12,6 +12,7 @@ import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,156 +35,164 @@ from .mujoco_tasks import MARKER, RobotLayout, RobotTask, numbers, task_of
 from .mujoco_warp import WarpStepper
 
 FILES = (".xml", ".mjcf", ".urdf")
-FASTEST = 1e4  # m/s or rad/s: a world that moves faster is unstable
-MOST_DUMPS = 8
+MAX_SPEED = 1e4  # m/s or rad/s; a faster world is unstable
+MAX_DUMPS = 8
 DRAWN, SCANNED = ("rgb", "depth", "segmentation"), ("contacts", SITE)
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
-class MujocoWorld:
-    """`MujocoWorld("go1")`, a robot that is ready to use (sim/mujoco_robots.py), or `MujocoWorld("FILE.xml")`, an MJCF or URDF.
+@dataclass(frozen=True)
+class MujocoConfig:
+    """The settings of a MujocoWorld."""
 
-    task:       what is wanted (sim/mujoco_tasks.py); default: the robot's own, or what a file tells.
-    control_s:  seconds of a control step, of which physics takes as many of its own as fit.
-    size:       (height, width) of pictures.
-    cameras:    names of cameras of the model, the first is `rgb`, others `rgb.NAME`; default: the first that there is; () for none.
-    depth, segmentation: show these beside each rgb.
-    lidar:      rays of a turn, or (rows, rays), that a site named "lidar" in the file sends out; lidar_m: how far, in m.
-    pilot:      False for the controls themselves of a robot that has an autopilot (the drone's thrusts).
-    threads:    that step worlds; default: as many as there are processors for this process.
-    device:     "cuda" steps on a GPU, by mujoco-warp in float32 (sim/mujoco_warp.py); states stay tensors of the CPU.
-    parameters: names of `parameters_of` that each world has values of its own of: `state["parameters"]` [B, n].
-    dumps:      folder for states that led to an unstable simulation; default: terrella-unstable-USER among temporary files.
+    # Reward and termination (sim/mujoco_tasks.py). Default: the robot's own, or the one that the file declares.
+    task: RobotTask | None = None
+    # Seconds of a control step, rounded to physics steps. Default: the robot's own, else 0.02.
+    control_s: float | None = None
+    # (height, width) of pictures.
+    size: tuple[int, int] = (96, 128)
+    # Names of cameras of the model: the first is `rgb`, others are `rgb.NAME`. Default: the model's first; () for none.
+    cameras: Sequence[str] | None = None
+    # Show depth for each camera.
+    depth: bool = False
+    # Show segmentation for each camera.
+    segmentation: bool = False
+    # Rays per turn, or (rows, rays), of a LiDAR at the site named "lidar".
+    lidar: int | Sequence[int] = 72
+    # Range of the LiDAR, m.
+    lidar_m: float = 20.0
+    # False: actions are the actuators' controls, even if the robot has an autopilot (the drone).
+    pilot: bool = True
+    # Threads that step worlds. Default: the processors of this process.
+    threads: int | None = None
+    # "cuda" steps on a GPU with mujoco-warp in float32 (sim/mujoco_warp.py); states stay CPU tensors.
+    device: str = ""
+    # Names in `parameters_of` whose values differ between worlds: `state["parameters"]` [B, n].
+    parameters: Sequence[str] = ()
+    # Folder for states before an unstable step. Default: terrella-unstable-USER in the temporary folder.
+    dumps: str | Path | None = None
+
+
+class MujocoWorld:
+    """`MujocoWorld("go1")`, a ready robot (sim/mujoco_robots.py), or `MujocoWorld("FILE.xml")`, an MJCF or URDF file.
 
     Actions are the actuators' controls, in their units. Channels: observation, qpos, qvel, sensor.NAME for each sensor, contacts
-    (N on each body, of the normal forces on it), reward, done, those of the task, and of each camera rgb, pose and what is asked
-    for. After `done` a world stands still with reward 0. Chance comes from `rng` at `start` alone.
-    State (tensors of rows): physics [B, n] float64 is MuJoCo's full physics state, time first, then qpos, qvel, act; warmstart
-    [B, nv] of the solver; ctrl [B, nu] of the last step; sensors; done; reward; what the task keeps.
-    TerrellaError, a sentence, for files that are missing or broken. Where a simulation is unstable, that world ends, a
-    warning says so, and the state before is saved with its action: imagine(state, state["action"], rng) repeats it.
+    (the sum of normal forces on each body, N), reward, done, those of the task, and rgb, pose, depth and segmentation of each
+    camera. After `done` a world stands still with reward 0. Only `start` uses `rng`.
+
+    State, all [B, ...]: physics float64 is MuJoCo's full physics state (time, qpos, qvel, act); warmstart [B, nv] of the solver;
+    ctrl [B, nu] of the last step; sensors; done; reward; the tensors of the task.
+
+    TerrellaError for missing or broken files. An unstable world ends with a warning, and the state before is saved with its
+    action: imagine(state, state["action"], rng) repeats the step.
     """
 
-    def __init__(
-        self,
-        name: str | Path | Robot,
-        *,
-        task: RobotTask | None = None,
-        control_s: float | None = None,
-        size: tuple[int, int] = (96, 128),
-        cameras: Sequence[str] | None = None,
-        depth: bool = False,
-        segmentation: bool = False,
-        lidar: int | Sequence[int] = 72,
-        lidar_m: float = 20.0,
-        pilot: bool = True,
-        threads: int | None = None,
-        device: str = "",
-        parameters: Sequence[str] = (),
-        dumps: str | Path | None = None,
-    ):
+    def __init__(self, name: str | Path | Robot, config: MujocoConfig = MujocoConfig()):
         label = name.file if isinstance(name, Robot) else str(name)
         robot = name if isinstance(name, Robot) else None if label.endswith(FILES) else robot_of(label)
         spec = complete(read(label) if robot is None else robot.spec(label), label)
         self._source, self._seen = spec, compiled(spec, label)
         self.file = bare(spec, self._seen, label)
-        self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it would begin anew in silence
+        self.file.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        )  # otherwise an unstable simulation would restart without a warning
         self.name = f"mujoco:{label}"
-        self._steps = max(1, round((control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
-        self._threads, self._device = threads or _cores(), device
-        self._dumps, self._dumped = (
-            Path(dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}"),
-            0,
-        )
+        self._steps = max(1, round((config.control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
+        self._threads, self._device = config.threads or _cores(), config.device
+        self._dumped = 0
+        self._dumps = Path(config.dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}")
         self._home = _home(self.file, robot)
-        self.task: RobotTask = task or (robot.task if robot else task_of(spec, label))
-        self.body = _body(self.file, self._home, self._steps)
-        self._cameras = _cameras(self._seen, cameras)
-        self._kinds = ("rgb", *(kind for kind, asked in (("depth", depth), ("segmentation", segmentation)) if asked))
-        self._size, self._limit = (int(size[0]), int(size[1])), robot.max_steps if robot else None
-        self._pilot = robot.pilot(self.file) if robot and robot.pilot and pilot else None
-        self._lidar = Lidar(self.file, lidar, lidar_m) if SITE in {site.name for site in spec.sites} else None
+        self.task: RobotTask = config.task or (robot.task if robot else task_of(spec, label))
+        self.layout = _layout(self.file, self._home, self._steps)
+        self._cameras = _cameras(self._seen, config.cameras)
+        shown = (("depth", config.depth), ("segmentation", config.segmentation))
+        self._kinds = ("rgb", *(kind for kind, wanted in shown if wanted))
+        self._size, self._limit = (int(config.size[0]), int(config.size[1])), robot.max_steps if robot else None
+        self._pilot = robot.pilot(self.file) if robot and robot.pilot and config.pilot else None
+        has_lidar = SITE in {site.name for site in spec.sites}
+        self._lidar = Lidar(self.file, config.lidar, config.lidar_m) if has_lidar else None
         self._keys, self._units = (dict(robot.keys), robot.units) if robot else ({}, ())
         self.parameters = parameters_of(self._seen)
         self._what = robot.what if robot else f"the model {Path(label).name}"
         self._lock = threading.Lock()
-        self._vary(tuple(parameters))
+        self._vary(tuple(config.parameters))
 
     def _vary(self, names: Sequence[str]) -> None:
-        """Lets worlds differ by these parameters, and makes what steps and draws them."""
+        """Makes these parameters differ between worlds, and builds the stepper and the renderer for them."""
         checked(self.parameters, names)
         self.varied, changes = tuple(names), [self.parameters[name] for name in names]
         seen = {names.index(name): one for name, one in self.parameters.items() if name in names and one.seen}
         stepped = {at: one for at, one in enumerate(changes) if not one.seen}
         on_gpu = self._device not in ("", "cpu")
         if on_gpu and stepped:
-            raise TerrellaError("physics that differs from world to world is for the CPU; leave device out.")
+            raise TerrellaError("physics that differs between worlds needs the CPU; leave device out.")
         self._stepper = WarpStepper(self.file, self._device) if on_gpu else Stepper(self.file, stepped, self._threads)
         drawn = patterned(self._source, self.name) if TEXTURES in changes else copy(self._seen)
-        self._pictures = MujocoRenderer(drawn, seen, self._size)
+        self._renderer = MujocoRenderer(drawn, seen, self._size)
         self.spec = self._describe()
 
     def varying(self, names: Sequence[str]) -> MujocoWorld:
-        """The same world, in which these parameters differ from world to world: see `adjusted`."""
+        """The same world with these parameters differing between the worlds of a batch: see `adjusted`."""
         other = copy(self)
         other._lock, other._dumped = threading.Lock(), 0
         other._vary(tuple(names))
         return other
 
     def adjusted(self, state: State, values: torch.Tensor) -> State:
-        """The state with values [B, n] of the parameters that vary. TerrellaError for values that are not safe."""
+        """The state with these values [B, n] of the varying parameters. TerrellaError for unsafe values."""
         for at, name in enumerate(self.varied):
             one, column = self.parameters[name], values[:, at]
             if not ((column >= one.low) & (column <= one.high)).all():
                 raise TerrellaError(
-                    f"the parameter '{name}' of {self.name} stays within {one.low:g} to {one.high:g} {one.unit}; got "
+                    f"the parameter '{name}' of {self.name} must be within {one.low:g} to {one.high:g} {one.unit}; got "
                     f"{float(column.min()):g} to {float(column.max()):g}."
                 )
         return state.replace(parameters=values.double())
 
-    def replaced(self, before: State, state: State, qpos: torch.Tensor, qvel: torch.Tensor) -> State:
-        """`state`, to which a step from `before` has led, with other qpos [B, nq] and qvel [B, nv]: sensed and judged anew."""
+    def with_joints(self, before: State, state: State, qpos: torch.Tensor, qvel: torch.Tensor) -> State:
+        """`state`, the result of a step from `before`, with qpos [B, nq] and qvel [B, nv] replaced; sensors, reward and done are
+        computed again."""
         physics = state["physics"].clone()
-        physics[:, self.body.qpos], physics[:, self.body.qvel] = qpos.double(), qvel.double()
+        physics[:, self.layout.qpos], physics[:, self.layout.qvel] = qpos.double(), qvel.double()
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
             _, sensors, _ = self._stepper.step(physics, state["warmstart"], state["ctrl"], values, 1)
         after = {"physics": physics, "sensors": sensors}
-        reward, fallen, kept = self.task.judge(self.body, before, {**dict(state.items()), **after})
-        over = before["done"]
-        return state.replace(**after, **kept, reward=reward.masked_fill(over, 0.0), done=state["done"] | fallen)
+        reward, fallen, kept = self.task.evaluate(self.layout, before, {**dict(state.items()), **after})
+        reward = reward.masked_fill(before["done"], 0.0)
+        return state.replace(**after, **kept, reward=reward, done=state["done"] | fallen)
 
     def fingerprint(self) -> str:
-        """All that its physics and its task are made of, as text: two worlds of the same text are the same world."""
+        """The model, the task and the version of MuJoCo as text: worlds with the same text are the same world."""
         return f"MuJoCo {mujoco.__version__}, {self._steps} steps a control step, {self.task}\n{self._source.to_xml()}"
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        """`batch` worlds at rest, changed as the task has it."""
+        """`batch` worlds at rest, changed by the task's initialisation."""
         if batch < 1:
-            raise TerrellaError("start needs a batch of one or more.")
-        body, seeds = self.body, chance.seeds(batch, rng)
+            raise TerrellaError(f"start needs a batch of 1 or more; got {batch}.")
+        layout, seeds = self.layout, chance.seeds(batch, rng)
         physics = torch.zeros(batch, mujoco.mj_stateSize(self.file, _FULL), dtype=torch.float64)
-        qpos, qvel = body.home.repeat(batch, 1), torch.zeros(batch, self.file.nv, dtype=torch.float64)
-        kept = self.task.begin(body, seeds, qpos, qvel)
-        physics[:, body.qpos], physics[:, body.qvel] = qpos, qvel
-        ctrl = body.rest.repeat(batch, 1)
+        qpos, qvel = layout.home.repeat(batch, 1), torch.zeros(batch, self.file.nv, dtype=torch.float64)
+        kept = self.task.initialise(layout, seeds, qpos, qvel)
+        physics[:, layout.qpos], physics[:, layout.qvel] = qpos, qvel
+        ctrl = layout.rest.repeat(batch, 1)
         nominal = torch.tensor([self.parameters[name].nominal for name in self.varied], dtype=torch.float64)
         values = nominal.repeat(batch, 1)
         none = torch.zeros(batch, self.file.nv, dtype=torch.float64)
         with self._lock:
-            _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # what is sensed before the first step
+            _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # the sensors before the first step
         held = {"physics": physics, "warmstart": none, "ctrl": ctrl, "sensors": sensors, **kept}
         held |= {"parameters": values} if self.varied else {}
         return State({**held, "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool)})
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """A simulator cannot be put into a state from what is seen of it: gives the prior, or a start."""
+        """The prior, or a start: a simulator cannot be set from an observation."""
         if observation:
-            raise ObservationError(f"{self.name} is a simulator and takes no evidence; pass an empty mapping.")
+            raise ObservationError(f"{self.name} is a simulator and accepts no observation; pass an empty mapping.")
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One control step of all worlds that are not done."""
+        """One control step of every world that is not done."""
         if "physics" not in state or state["physics"].shape[1] != mujoco.mj_stateSize(self.file, _FULL):
             raise TerrellaError(f"this is not a state of {self.name}: {state}.")
         ctrl = self.spec.check_action(action, state.batch).double()
@@ -192,105 +201,106 @@ class MujocoWorld:
             return state.replace(reward=torch.zeros(state.batch))
         if done.any():
             live = (~done).nonzero()[:, 0]
-            return state.replace(reward=torch.zeros(state.batch)).put(live, self._moved(state.at(live), ctrl[live]))
-        return self._moved(state, ctrl)
+            return state.replace(reward=torch.zeros(state.batch)).put(live, self._stepped(state.at(live), ctrl[live]))
+        return self._stepped(state, ctrl)
 
-    def _moved(self, state: State, action: torch.Tensor) -> State:
-        ctrl = action if self._pilot is None else self._pilot(self.body, state["physics"], action)
+    def _stepped(self, state: State, action: torch.Tensor) -> State:
+        ctrl = action if self._pilot is None else self._pilot(self.layout, state["physics"], action)
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
-            moved = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
-        physics, sensors, warmstart = moved
-        wild = ~(physics.isfinite().all(1) & (physics[:, self.body.qvel].abs() < FASTEST).all(1))
-        if wild.any():
-            self._dump(state.at(wild.nonzero()[:, 0]), action[wild])
+            result = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
+        physics, sensors, warmstart = result
+        unstable = ~(physics.isfinite().all(1) & (physics[:, self.layout.qvel].abs() < MAX_SPEED).all(1))
+        if unstable.any():
+            self._dump(state.at(unstable.nonzero()[:, 0]), action[unstable])
             keep = {"physics": state["physics"], "sensors": state["sensors"], "warmstart": state["warmstart"]}
             physics, sensors, warmstart = (
-                torch.where(wild[:, None], keep[name], one) for name, one in zip(keep, (physics, sensors, warmstart))
+                torch.where(unstable[:, None], keep[name], one)
+                for name, one in zip(keep, (physics, sensors, warmstart))
             )
         after = {"physics": physics, "sensors": sensors, "warmstart": warmstart, "ctrl": ctrl}
-        reward, fallen, kept = self.task.judge(self.body, state, {**dict(state.items()), **after})
-        return state.replace(**after, **kept, reward=reward.masked_fill(wild, 0.0), done=fallen | wild)
+        reward, fallen, kept = self.task.evaluate(self.layout, state, {**dict(state.items()), **after})
+        return state.replace(**after, **kept, reward=reward.masked_fill(unstable, 0.0), done=fallen | unstable)
 
     def _dump(self, state: State, action: torch.Tensor) -> None:
-        """Saves the states before a simulation became unstable, with the actions; says so."""
+        """Saves the states before an unstable step with their actions, and warns."""
         self._dumped += 1
-        if self._dumped > MOST_DUMPS:
+        if self._dumped > MAX_DUMPS:
             return
         stem = "".join(letter if letter.isalnum() else "-" for letter in self.name)
         file = self._dumps / f"{stem}-{os.getpid()}-{self._dumped}.safetensors"
         try:
             self._dumps.mkdir(parents=True, exist_ok=True)
             state.replace(action=action.float()).save(file)
-            kept = f"the states before and their actions are in {file}"
+            kept = f"the previous states and their actions are in {file}"
         except OSError as error:
-            kept = f"the states before could not be saved ({error})"
+            kept = f"the previous states could not be saved ({error})"
         warnings.warn(
             f"{state.batch} worlds of {self.name} became unstable at {float(state['physics'][0, 0]):.2f} s and have ended; {kept}: "
-            "make the timestep smaller or servos weaker.",
+            "use a smaller timestep or weaker servos.",
             RuntimeWarning,
             stacklevel=4,
         )
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
-        drawn = [name for name in channels if kind_of(name) in (*DRAWN, *SCANNED, "pose")]
-        found = self._drawn(state, drawn) if drawn else {}
-        return {name: found[name] if name in found else self._read(state, name) for name in channels}
+        single = [name for name in channels if kind_of(name) in (*DRAWN, *SCANNED, "pose")]
+        rendered = self._rendered(state, single) if single else {}
+        return {name: rendered[name] if name in rendered else self._read(state, name) for name in channels}
 
     def close(self) -> None:
-        self._pictures.close()
+        self._renderer.close()
         self._stepper.close()
 
     def _read(self, state: State, name: str) -> torch.Tensor:
         if name in ("reward", "done"):
             return state[name]
         if name in ("qpos", "qvel"):
-            return state["physics"][:, getattr(self.body, name)].float()
+            return state["physics"][:, getattr(self.layout, name)].float()
         if kind_of(name) == "sensor":
-            return state["sensors"][:, self.body.sensors[suffix_of(name)]].float()
-        return self.task.see(self.body, state, name)
+            return state["sensors"][:, self.layout.sensors[suffix_of(name)]].float()
+        return self.task.render(self.layout, state, name)
 
-    def _drawn(self, state: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
-        """What is worked out world by world: pictures, poses, contacts, LiDAR."""
-        found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    def _rendered(self, state: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
+        """Channels that are computed world by world: pictures, poses, contacts, LiDAR."""
+        rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
         physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
         values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
-        marks = state[MARKER].numpy() if MARKER in state else [None] * state.batch
-        looked = [name for name in names if kind_of(name) not in SCANNED and kind_of(name) != "rgb"]
+        markers = state[MARKER].numpy() if MARKER in state else [None] * state.batch
+        posed = [name for name in names if kind_of(name) not in SCANNED and kind_of(name) != "rgb"]
         with self._lock:
             for name in names:
                 if kind_of(name) == "rgb":
-                    found[name] = self._pictured(self._camera_of(name), physics, values, marks)
-            for row, control, value, mark in zip(physics, ctrl, values, marks):
-                if looked:
-                    self._pictures.put(row, value, mark)
+                    rows[name] = self._coloured(self._camera_of(name), physics, values, markers)
+            for row, control, value, marker in zip(physics, ctrl, values, markers):
+                if posed:
+                    self._renderer.set_world(row, value, marker)
                 for name in names:
                     kind, camera = kind_of(name), self._camera_of(name)
                     if kind == "contacts":
-                        found[name].append(self._stepper.contacts(row, control, value))
+                        rows[name].append(self._stepper.contacts(row, control, value))
                     elif kind == SITE and self._lidar:
-                        found[name].append(self._lidar.scan(*self._stepper.standing(row, value)))
+                        rows[name].append(self._lidar.scan(*self._stepper.placed(row, value)))
                     elif kind == "pose":
-                        found[name].append(self._pictures.pose(camera))
+                        rows[name].append(self._renderer.pose(camera))
                     elif kind != "rgb":
-                        found[name].append(self._pictures.measure(camera, kind))
-        return {name: torch.from_numpy(np.stack(rows)) for name, rows in found.items()}
+                        rows[name].append(self._renderer.measure(camera, kind))
+        return {name: torch.from_numpy(np.stack(values)) for name, values in rows.items()}
 
     def _camera_of(self, channel: str) -> str:
         return suffix_of(channel) or (self._cameras or [""])[0]
 
-    def _pictured(self, camera: str, physics: np.ndarray, values: np.ndarray, marks: Any) -> list[np.ndarray]:
-        """What a camera sees of each world, in colour."""
-        found: list[np.ndarray] = []
-        for at, (row, value, mark) in enumerate(zip(physics, values, marks)):
-            self._pictures.put(row, value, mark)
-            if self._pictures.draw(camera) or at == len(physics) - 1:
-                found += list(self._pictures.read())
-        return found
+    def _coloured(self, camera: str, physics: np.ndarray, values: np.ndarray, markers: Any) -> list[np.ndarray]:
+        """The colour picture of each world from a camera."""
+        pictures: list[np.ndarray] = []
+        for at, (row, value, marker) in enumerate(zip(physics, values, markers)):
+            self._renderer.set_world(row, value, marker)
+            if self._renderer.draw(camera) or at == len(physics) - 1:
+                pictures += list(self._renderer.read())
+        return pictures
 
     def _describe(self) -> Spec:
-        model, body = self.file, self.body
+        model, layout = self.file, self.layout
         suffix = {camera: f".{camera}" if at else "" for at, camera in enumerate(self._cameras)}
         height, width = self._size
         spaces_of = {
@@ -298,11 +308,11 @@ class MujocoWorld:
             "depth": spaces.Box(0, np.inf, (height, width), np.float32),
             "segmentation": spaces.Box(-1, model.nbody, (height, width), np.int32),
         }
-        told = self.task.channels(body)
-        channels = {name: space for name, (space, _) in told.items()}
-        units = {name: unit for name, (_, unit) in told.items() if unit}
+        own = self.task.channels(layout)
+        channels = {name: space for name, (space, _) in own.items()}
+        units = {name: unit for name, (_, unit) in own.items() if unit}
         channels |= {"qpos": numbers(model.nq), "qvel": numbers(model.nv)}
-        channels |= {f"sensor.{name}": numbers(at.stop - at.start) for name, at in body.sensors.items()}
+        channels |= {f"sensor.{name}": numbers(at.stop - at.start) for name, at in layout.sensors.items()}
         channels |= {"contacts": numbers(model.nbody), "done": DONE}
         channels |= {"reward": REWARD} if self.task.rewards else {}
         if self._lidar:
@@ -313,23 +323,23 @@ class MujocoWorld:
         cameras = {f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
         return Spec(
             name=self.name,
-            **self._acts(),
+            **self._action_fields(),
             channels=channels,
             observes=(),
             dt_s=self._steps * float(model.opt.timestep),
             units=units | {"contacts": "N"},
-            # Where lenses vary from world to world, none is told: pictures of a false one would mislead whoever trusts it.
+            # Where the field of view differs between worlds, the Spec has no intrinsics, because one set would be wrong.
             cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
             card={
-                "what": self._what, "kind": "simulator", "physics": _told(model, self._steps), "varied": list(self.varied),
+                "what": self._what, "kind": "simulator", "physics": _physics_text(model, self._steps), "varied": list(self.varied),
                 "together": True,
             },
         )  # fmt: skip
 
-    def _acts(self) -> dict[str, Any]:
-        """What the Spec says of actions: the pilot's, or the actuators' controls."""
-        model, body, pilot = self.file, self.body, self._pilot
+    def _action_fields(self) -> dict[str, Any]:
+        """The action fields of the Spec: the pilot's, or the actuators' controls."""
+        model, layout, pilot = self.file, self.layout, self._pilot
         if pilot is not None:
             high = np.array(pilot.high, np.float32)
             named = {
@@ -339,24 +349,24 @@ class MujocoWorld:
                 "action_frame": "body",
             }
             return {"action": spaces.Box(-high, high), "keys": dict(pilot.keys), "idle": (0.0,) * len(high), **named}
-        low, high = (limit.numpy().astype(np.float32) for limit in (body.low, body.high))
+        low, high = (limit.numpy().astype(np.float32) for limit in (layout.low, layout.high))
         return {
             "action": spaces.Box(low, high),
             "action_names": tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
             "action_units": self._units or tuple(_unit(model, at) for at in range(model.nu)),
             "action_mode": _mode(model),
             "keys": self._keys,
-            "idle": tuple(body.rest.float().tolist()),
+            "idle": tuple(layout.rest.float().tolist()),
         }
 
 
 def _cores() -> int:
-    """Of this machine, those that this process may use."""
+    """The number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.ndarray]:
-    """qpos [nq] and ctrl [nu] at rest: the robot's pose, the file's first keyframe, or as it is built."""
+    """qpos [nq] and ctrl [nu] at rest: the robot's pose, the file's first keyframe, or the reference pose."""
     qpos, ctrl = (model.key_qpos[0], model.key_ctrl[0]) if model.nkey else (model.qpos0, np.zeros(model.nu))
     qpos, ctrl = qpos.copy(), ctrl.copy()
     if robot is not None and robot.pose:
@@ -372,7 +382,7 @@ def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.nd
     return qpos, ctrl
 
 
-def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> RobotLayout:
+def _layout(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> RobotLayout:
     limited = model.actuator_ctrllimited.astype(bool)
     low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
     high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
@@ -401,16 +411,16 @@ def _body(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int
     )
 
 
-def _cameras(model: mujoco.MjModel, asked: Sequence[str] | None) -> list[str]:
+def _cameras(model: mujoco.MjModel, wanted: Sequence[str] | None) -> list[str]:
     known = [model.camera(at).name for at in range(model.ncam) if model.camera(at).name]
-    strangers = sorted(set(asked or ()) - set(known))
-    if strangers:
-        raise TerrellaError(f"there is no camera {', '.join(strangers)}; there are {', '.join(known)}.")
-    return known[:1] if asked is None else list(asked)
+    unknown = sorted(set(wanted or ()) - set(known))
+    if unknown:
+        raise TerrellaError(f"there is no camera {', '.join(unknown)}; there are {', '.join(known)}.")
+    return known[:1] if wanted is None else list(wanted)
 
 
 def _unit(model: mujoco.MjModel, at: int) -> str:
-    """Of a control: rad, rad/s or N m of hinges, m, m/s or N of slides; "" of what has no unit of its own."""
+    """The unit of a control: rad, rad/s or N m for hinges; m, m/s or N for slides; else ""."""
     joint = model.actuator_trnid[at, 0]
     if model.actuator_trntype[at] != int(mujoco.mjtTrn.mjTRN_JOINT):
         return ""
@@ -430,8 +440,8 @@ def _mode(model: mujoco.MjModel) -> str:
     return "axes" if servo.any() or (model.actuator_biasprm[:, 2] < 0).any() else "torque"
 
 
-def _told(model: mujoco.MjModel, steps: int) -> str:
-    """What a figure of speed means: step, decimation, integrator, solver, cone."""
+def _physics_text(model: mujoco.MjModel, steps: int) -> str:
+    """The settings that a simulation speed depends on: step, decimation, integrator, solver, cone."""
     integrator = mujoco.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_")
     solver, cone = mujoco.mjtSolver(model.opt.solver).name, mujoco.mjtCone(model.opt.cone).name
     kinds = f"{integrator}, {solver.removeprefix('mjSOL_')}, {cone.removeprefix('mjCONE_')} cone"

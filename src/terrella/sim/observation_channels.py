@@ -1,4 +1,4 @@
-"""Which channels the observations of a Gymnasium environment have: pictures of any form, and the parts of a dictionary."""
+"""The channels in the observations of a Gymnasium environment: pictures of any layout, and entries of a Dict."""
 
 from __future__ import annotations
 
@@ -14,25 +14,21 @@ from PIL import Image
 from ..core.errors import TerrellaError
 
 _KNOWN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
-_PIXELS = 16  # least side of what counts as a picture, where nothing else says so
-_SHAPES = {
-    "depth": 2,
-    "reward": -1,
-    "done": -1,
-}  # axes that a channel of this name must have; -1: it is not for observations
+_PIXELS = 16  # smallest side of a picture
+# Number of axes that a channel of this name must have; -1: not allowed in observations.
+_AXES = {"depth": 2, "reward": -1, "done": -1}
 
 
 @dataclass(frozen=True)
-class Part:
-    """A channel of an observation: `key` of the dictionary (None: the observation itself), and the form of a picture
-    ("hwc", "chw", "hw"; "" for what is none)."""
+class ObservationPart:
+    """A channel of an observation."""
 
-    key: str | None
+    key: str | None  # of a Dict; None for the observation itself
     space: spaces.Space
-    form: str = ""
+    form: str = ""  # layout of a picture: "hwc", "chw" or "hw"; "" for other arrays
 
     def read(self, observation: Any, name: str) -> np.ndarray:
-        """The value; a picture becomes uint8 [H, W, 3]. TerrellaError where its shape is not the space's."""
+        """The value; a picture becomes uint8 [H, W, 3]. TerrellaError where its shape differs from the space."""
         given = observation if self.key is None else observation[self.key]
         value = np.asarray(given)
         if self.form:
@@ -45,38 +41,39 @@ class Part:
             ) from error
 
 
-def parts_of(space: spaces.Space, name: str, rgb: bool, drawn: bool) -> dict[str, Part]:
-    """channel -> Part. Of a Dict the entries that are arrays, by their names; the picture among them is `rgb`, where that is
-    wanted and the environment draws none itself. TerrellaError where there is nothing that can be taken."""
+def parts_of(space: spaces.Space, name: str, rgb: bool, drawn: bool) -> dict[str, ObservationPart]:
+    """Channel -> part. The arrays of a Dict keep their names; a picture among them becomes `rgb` if that is wanted and the
+    environment renders none itself (`drawn`). TerrellaError where there is no array.
+    """
     if not isinstance(space, spaces.Dict):
         check_space(space, name)
         form = picture_form(space) if rgb else ""
-        return {"rgb" if form else "observation": Part(None, space, form)}
-    found: dict[str, Part] = {}
+        return {"rgb" if form else "observation": ObservationPart(None, space, form)}
+    parts: dict[str, ObservationPart] = {}
     for key, inner in space.spaces.items():
         channel = re.sub(r"\W", "_", str(key))
         if not isinstance(inner, _KNOWN_SPACES):
             continue
         form = picture_form(inner)
         large = rgb and form and min(sorted(inner.shape or ())[-2:]) >= _PIXELS
-        if large and "rgb" not in found and (channel == "rgb" or not drawn):
-            found["rgb"] = Part(key, inner, form)
+        if large and "rgb" not in parts and (channel == "rgb" or not drawn):
+            parts["rgb"] = ObservationPart(key, inner, form)
             continue
-        fits = channel != "rgb" and _SHAPES.get(channel, len(inner.shape or ())) == len(inner.shape or ())
-        found[channel if fits else f"seen_{channel}"] = Part(key, inner)
-    if not found:
+        fits = channel != "rgb" and _AXES.get(channel, len(inner.shape or ())) == len(inner.shape or ())
+        parts[channel if fits else f"seen_{channel}"] = ObservationPart(key, inner)
+    if not parts:
         check_space(space, name)
-    return found
+    return parts
 
 
 def check_space(space: spaces.Space, name: str) -> None:
-    """TerrellaError where the values of a space are not one array."""
+    """TerrellaError where values of the space are not one array."""
     if not isinstance(space, _KNOWN_SPACES):
         raise TerrellaError(f"{name} has the space {space}; wrap it so that it is one array (FlattenObservation).")
 
 
 def picture_form(space: spaces.Space) -> str:
-    """How a space holds pictures: uint8, or floats up to 1; colours last or first, or grey; "" where it holds none."""
+    """The layout of a space of pictures (uint8, or floats up to 1): "hwc", "chw", "hw"; else ""."""
     shape = space.shape or ()
     if not isinstance(space, spaces.Box):
         return ""
@@ -94,11 +91,9 @@ def picture_form(space: spaces.Space) -> str:
 
 
 def as_picture(value: np.ndarray, form: str, name: str) -> np.ndarray:
-    """uint8 [H, W, 3] of a picture in any form."""
+    """A picture of any layout as uint8 [H, W, 3]."""
     if value.ndim != len(form):
-        raise TerrellaError(
-            f"{name} gave a picture of shape {value.shape}, which is not of the form that its space has."
-        )
+        raise TerrellaError(f"{name} gave a picture of shape {value.shape}, which does not match its space.")
     if value.dtype != np.uint8:
         value = (np.clip(value, 0, 1) * 255).round().astype(np.uint8)
     value = value.transpose(1, 2, 0) if form == "chw" else value[..., None] if form == "hw" else value
@@ -106,7 +101,7 @@ def as_picture(value: np.ndarray, form: str, name: str) -> np.ndarray:
 
 
 def resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
-    """uint8 [H, W, 3] -> uint8 [*size, 3], each pixel the mean of the area that it covers."""
+    """uint8 [H, W, 3] -> uint8 [*size, 3], area-averaged."""
     if size is None or picture.shape[:2] == tuple(size):
         return picture
     picture = np.ascontiguousarray(picture)
@@ -114,10 +109,10 @@ def resized(picture: np.ndarray, size: tuple[int, int] | None) -> np.ndarray:
 
 
 def space_of(value: Any, kind: str) -> spaces.Space:
-    """The space of a channel of some kind that is read off `info` or an attribute, from one value of it."""
+    """The space of a channel of this kind, from one value in `info` or an attribute."""
     array = np.asarray(value, np.float32) if kind in ("depth", "pose") else np.asarray(value)
     if array.dtype.kind not in "biuf":
-        raise TerrellaError(f"it is {array.dtype}, and a channel is made of numbers")
+        raise TerrellaError(f"it is {array.dtype}, not numbers")
     if array.dtype.kind == "f":
         return spaces.Box(-np.inf, np.inf, array.shape, np.float32)
     if array.dtype == bool:
@@ -126,9 +121,10 @@ def space_of(value: Any, kind: str) -> spaces.Space:
     return spaces.Box(limit.min, limit.max, array.shape, array.dtype.type)
 
 
-def followed(env: Any, info: Mapping, path: str) -> Any:
-    """What "info.depth" or "camera.pose" means: a key of the last `info`, or attributes of the bare environment, one after
-    another; a method without arguments is called."""
+def value_at(env: Any, info: Mapping, path: str) -> Any:
+    """The value at "info.depth", a key of the last `info`, or at "camera.pose", attributes of the bare environment; methods are
+    called.
+    """
     words, value = path.split("."), env
     if words[0] == "info":
         value, words = info, words[1:]

@@ -1,4 +1,4 @@
-"""Perceived: a World around a World, in which policies see the goal that an encoder read off a picture."""
+"""Perceived: a World around a World, in which policies see a goal that an encoder estimates from a picture."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from ..core.state import State
 from ..core.world import World
 from .wrapper import WorldWrapper
 
-GOAL, SEEN = "goal", "perceived.goal"
+GOAL, ESTIMATE = "goal", "perceived.goal"
 
 
 class Perceived(WorldWrapper[World]):
-    """`Perceived(world, encoder)`: of a world whose states keep a `goal` [B, n] and which shows `camera`.
+    """`Perceived(world, encoder)`, for a world whose states have a `goal` [B, n] and which shows `camera`.
 
-    encoder: pictures uint8 [B, H, W, 3] -> goals [B, n], float32, in the goal's units. One picture is taken when an episode
-    begins. The channels of `told` are made with that goal; whatever else, as reward and success, with the true one.
-    TerrellaError where there is no camera or no goal.
+    encoder:  pictures uint8 [B, H, W, 3] -> goals float32 [B, n], in the goal's units. It sees one picture, at the start of an
+              episode.
+    channels: those that are rendered with the estimated goal; all others, such as reward and success, use the true one.
+    TerrellaError where there is no such camera or no goal.
     """
 
     def __init__(
@@ -28,36 +29,35 @@ class Perceived(WorldWrapper[World]):
         world: World,
         encoder: Callable[[torch.Tensor], torch.Tensor],
         camera: str = "rgb",
-        told: Sequence[str] = ("observation",),
+        channels: Sequence[str] = ("observation",),
     ):
         if camera not in world.spec.channels:
             shown = ", ".join(world.spec.channels)
-            raise TerrellaError(
-                f"{world.spec.name} shows no '{camera}', so that no goal can be read off it; it shows {shown}."
-            )
-        world.spec.check_channels(told)
-        self.world, self.encoder, self.camera, self.told = world, encoder, camera, tuple(told)
+            raise TerrellaError(f"{world.spec.name} shows no '{camera}' to estimate a goal from; it shows {shown}.")
+        world.spec.check_channels(channels)
+        self.world, self.encoder, self.camera, self.channels = world, encoder, camera, tuple(channels)
         self.spec = replace(world.spec, differentiable=False)
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        return self._looked(self.world.start(batch, rng))
+        return self._estimated(self.world.start(batch, rng))
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        found = self.world.observe(observation, prior, rng)
-        return self._looked(found) if prior is None else found.replace(**{SEEN: prior[SEEN]})
+        state = self.world.observe(observation, prior, rng)
+        return self._estimated(state) if prior is None else state.replace(**{ESTIMATE: prior[ESTIMATE]})
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        return self.world.imagine(state, action, rng).replace(**{SEEN: state[SEEN]})
+        return self.world.imagine(state, action, rng).replace(**{ESTIMATE: state[ESTIMATE]})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
-        told = [name for name in channels if name in self.told]
-        seen = dict(self.world.render(state, [name for name in channels if name not in told]))
-        if told:
-            seen |= self.world.render(state.replace(**{GOAL: state[SEEN]}), told)
+        estimated = [name for name in channels if name in self.channels]
+        seen = dict(self.world.render(state, [name for name in channels if name not in estimated]))
+        if estimated:
+            seen |= self.world.render(state.replace(**{GOAL: state[ESTIMATE]}), estimated)
         return {name: seen[name] for name in channels}
 
-    def _looked(self, state: State) -> State:
+    def _estimated(self, state: State) -> State:
+        """The state with a goal estimated from its picture."""
         if GOAL not in state:
-            raise TerrellaError(f"the states of {self.spec.name} keep no '{GOAL}' that could be read off a picture.")
-        found = self.encoder(self.world.render(state, (self.camera,))[self.camera])
-        return state.replace(**{SEEN: found.to(state[GOAL].dtype).reshape(state[GOAL].shape)})
+            raise TerrellaError(f"the states of {self.spec.name} have no '{GOAL}' to estimate from a picture.")
+        goal = self.encoder(self.world.render(state, (self.camera,))[self.camera])
+        return state.replace(**{ESTIMATE: goal.to(state[GOAL].dtype).reshape(state[GOAL].shape)})

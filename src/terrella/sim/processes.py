@@ -1,4 +1,4 @@
-"""Several episodes of an environment that cannot be copied, each in a process of its own."""
+"""Parallel episodes of an environment that cannot be copied, each in its own process."""
 
 from __future__ import annotations
 
@@ -21,43 +21,42 @@ from gymnasium.vector.utils import CloudpickleWrapper
 from ..core.errors import StaleStateError, TerrellaError
 from ..core.state import State
 
-MOST = 64
+MAX_EPISODES = 64
 Row = dict[str, np.ndarray]
 
 
 class ProcessEpisode(Protocol):
-    """What a process holds: one episode at a time. `begin` and `move` give what is seen, a value [*shape] a channel."""
+    """The episode in a process. `begin` and `step` return a value [*shape] per channel, `look` that of one channel."""
 
     def begin(self, seed: int) -> Row: ...
 
-    def move(self, action: np.ndarray) -> Row: ...
+    def step(self, action: np.ndarray) -> Row: ...
 
     def look(self, name: str) -> np.ndarray: ...
 
 
-class _Seat:
-    """The near end of a process, which episode it plays, how many steps of it, and what was seen last."""
+class _Worker:
+    """Our end of a process: its episode's number, age in steps, and latest channels."""
 
     def __init__(self, pipe: Connection):
         self.pipe, self.number, self.age, self.row = pipe, -1, 0, dict[str, Any]()
 
 
 class Processes:
-    """The verbs of a World over as many processes as the largest state has entries; `make`, which is sent to each, builds an
-    ProcessEpisode there.
+    """Parallel episodes behind the methods of a World. `make` is sent to each process and builds a ProcessEpisode there.
 
-    States are tickets: an entry is the number of an episode and of its step. A fresh start waits until it is first looked at or
-    moved, and then takes a process that no other entry of that state has; so after `state.put(index, fresh)` it has that of the
-    episode in whose place it was put.
+    A state is a ticket: the number of each entry's episode and its age. A new episode is reset when it is first rendered or
+    stepped, in a process that no other entry of that state uses; so after `state.put(index, fresh)` it takes over the process of
+    the episode that it replaces.
     """
 
     def __init__(self, name: str, make: Callable[[], ProcessEpisode]):
         self._name, self._make = name, make
-        self._seats: list[_Seat] = []
+        self._workers: list[_Worker] = []
         self._waiting: dict[int, int] = {}  # number -> seed
         self._next = 0
         self._launched: list[subprocess.Popen] = []
-        self.close = weakref.finalize(self, _end, self._seats, self._launched)
+        self.close = weakref.finalize(self, _end, self._workers, self._launched)
 
     def start(self, seeds: Sequence[int]) -> State:
         numbers = range(self._next, self._next + len(seeds))
@@ -67,29 +66,31 @@ class Processes:
         return State({"episode": torch.tensor(numbers), "age": blank, "truncated": blank.bool()})
 
     def imagine(self, state: State, actions: np.ndarray) -> State:
-        seats = self._seated(state)
-        moved = [(seat, action) for seat, action in zip(seats, actions) if not seat.row["done"]]
-        for seat in seats:
-            seat.age, seat.row = seat.age + 1, {**seat.row, "reward": np.float32(0)}
-        for (seat, _), row in zip(
-            moved, self._ask([seat for seat, _ in moved], "move", [action for _, action in moved])
+        workers = self._assigned(state)
+        running = [(worker, action) for worker, action in zip(workers, actions) if not worker.row["done"]]
+        for worker in workers:
+            worker.age, worker.row = worker.age + 1, {**worker.row, "reward": np.float32(0)}
+        for (worker, _), row in zip(
+            running, self._ask([worker for worker, _ in running], "step", [action for _, action in running])
         ):
-            seat.row = row
-        truncated = torch.tensor([bool(seat.row["truncated"]) for seat in seats])
+            worker.row = row
+        truncated = torch.tensor([bool(worker.row["truncated"]) for worker in workers])
         return state.replace(age=state["age"] + 1, truncated=truncated)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
-        seats, seen = self._seated(state), {}
+        workers, seen = self._assigned(state), {}
         for name in channels:
-            known = name in seats[0].row
-            values = [seat.row[name] for seat in seats] if known else self._ask(seats, "look", [name] * len(seats))
+            known = name in workers[0].row
+            values = (
+                [worker.row[name] for worker in workers] if known else self._ask(workers, "look", [name] * len(workers))
+            )
             seen[name] = torch.from_numpy(np.stack(values))
         return seen
 
-    def _seated(self, state: State) -> list[_Seat]:
-        """The processes of the state's entries, in their order."""
+    def _assigned(self, state: State) -> list[_Worker]:
+        """The processes of the state's entries, in order. New episodes are reset."""
         numbers, ages = state["episode"].tolist(), state["age"].tolist()
-        held = {seat.number: seat for seat in self._seats}
+        held = {worker.number: worker for worker in self._workers}
         gone = [
             one
             for one, age in zip(numbers, ages)
@@ -98,39 +99,39 @@ class Processes:
         if gone or len(set(numbers)) < len(numbers):
             raise StaleStateError(f"{self._name} has moved on since this state and cannot go back or be forked.")
         fresh = [number for number in numbers if number in self._waiting]
-        free = [seat for seat in self._seats if seat.number not in numbers]
+        free = [worker for worker in self._workers if worker.number not in numbers]
         if len(free) < len(fresh):
             free += self._launch(len(fresh) - len(free))
         taken = free[: len(fresh)]
-        for seat, number in zip(taken, fresh):
-            seat.number, seat.age = number, 0
-        for seat, row in zip(taken, self._ask(taken, "begin", [self._waiting.pop(number) for number in fresh])):
-            seat.row = row
-        held = {seat.number: seat for seat in self._seats}
+        for worker, number in zip(taken, fresh):
+            worker.number, worker.age = number, 0
+        for worker, row in zip(taken, self._ask(taken, "begin", [self._waiting.pop(number) for number in fresh])):
+            worker.row = row
+        held = {worker.number: worker for worker in self._workers}
         return [held[number] for number in numbers]
 
-    def _ask(self, seats: Sequence[_Seat], verb: str, given: Sequence[Any]) -> list[Any]:
-        """What the processes answer, which all work at the same time; TerrellaError after all of them where one failed."""
-        for seat, value in zip(seats, given):
+    def _ask(self, workers: Sequence[_Worker], verb: str, given: Sequence[Any]) -> list[Any]:
+        """The answers of the processes, which work in parallel; TerrellaError, after all have answered, if one failed."""
+        for worker, value in zip(workers, given):
             with suppress(OSError):
-                seat.pipe.send((verb, value))
+                worker.pipe.send((verb, value))
         answers, failed = [], ""
-        for seat in seats:
+        for worker in workers:
             try:
-                done, answer = seat.pipe.recv()
+                done, answer = worker.pipe.recv()
                 failed = failed or ("" if done else answer)
                 answers.append(answer)
             except (EOFError, OSError):
-                seat.pipe.close()
-                if seat in self._seats:
-                    self._seats.remove(seat)
-                failed = f"a process of {self._name} crashed or was killed; after a reset another takes its place."
+                worker.pipe.close()
+                if worker in self._workers:
+                    self._workers.remove(worker)
+                failed = f"a process of {self._name} crashed or was killed; a reset starts another one."
         if failed:
             raise TerrellaError(failed)
         return answers
 
-    def _launch(self, count: int) -> list[_Seat]:
-        """One process that has imported everything and then forks itself: the caller's __main__ is not run again there."""
+    def _launch(self, count: int) -> list[_Worker]:
+        """Starts one process that imports everything and then forks itself; it does not run the caller's __main__ again."""
         pairs = [Pipe() for _ in range(count)]
         theirs = [far.fileno() for _, far in pairs]
         around = {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path), "OMP_NUM_THREADS": "1"}
@@ -140,17 +141,17 @@ class Processes:
         self._launched.append(subprocess.Popen(command, env={**os.environ, **around}, **more))
         for _, far in pairs:
             far.close()
-        seats = [_Seat(near) for near, _ in pairs]
-        self._ask(seats, "make", [pickle.dumps(CloudpickleWrapper(self._make))] * count)  # pyright: ignore[reportArgumentType]
-        self._seats += seats
-        return seats
+        workers = [_Worker(near) for near, _ in pairs]
+        self._ask(workers, "make", [pickle.dumps(CloudpickleWrapper(self._make))] * count)  # pyright: ignore[reportArgumentType]
+        self._workers += workers
+        return workers
 
 
-def _end(seats: list[_Seat], launched: list[subprocess.Popen]) -> None:
-    """Hangs up, at which the processes end; one that hangs is killed."""
-    for seat in seats:
-        seat.pipe.close()
-    seats.clear()
+def _end(workers: list[_Worker], launched: list[subprocess.Popen]) -> None:
+    """Closes the pipes, which ends the processes; one that does not end is killed."""
+    for worker in workers:
+        worker.pipe.close()
+    workers.clear()
     for process in launched:
         try:
             process.wait(5)
@@ -161,7 +162,7 @@ def _end(seats: list[_Seat], launched: list[subprocess.Popen]) -> None:
 
 
 def work(pipes: Sequence[int]) -> None:
-    """In the process that was launched: a child for each pipe, until all have ended."""
+    """Runs in the launched process: forks a child for each pipe, and waits until all have ended."""
     for number, pipe in enumerate(pipes):
         if not os.fork():
             for other in pipes[number + 1 :]:
@@ -179,12 +180,12 @@ def _serve(pipe: Connection) -> None:
         while True:
             verb, given = pipe.recv()
             try:
-                if verb == "make":  # of the caller's own pipe, never of a file: read here, so that a fault is an answer
+                if verb == "make":  # from the caller's own pipe, never from a file; an error here becomes an answer
                     episode, answer = pickle.loads(given)(), None
                 else:
                     answer = getattr(episode, verb)(given)
                 answer = True, answer
             except Exception as error:
-                whole = f"an episode cannot be played in a process of its own: {type(error).__name__}: {error}"
+                whole = f"an episode cannot run in its own process: {type(error).__name__}: {error}"
                 answer = False, str(error) if isinstance(error, TerrellaError) else whole
             pipe.send(answer)

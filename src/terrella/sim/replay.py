@@ -1,4 +1,4 @@
-"""A recorded episode as a World: what was recorded comes back frame by frame, whatever the action."""
+"""A recorded episode as a World: it shows the recorded frames in order, whatever the action."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from ..core.state import State
 class ReplayWorld:
     """One episode of T + 1 frames.
 
-    channels:     name -> array or tensor [T + 1, ...], row t as a World would render it at frame t (so `reward` and
-                  `done` are those of the step that led to frame t; row 0 has 0 and False). Memory-mapped arrays are
-                  read as they are needed.
-    actions:      [T, *action.shape], the action that led from frame t to t + 1; kept for whoever compares.
-    action:       the action space; `imagine` checks what it is given against it and otherwise does not care.
-    spaces_given: name -> space, where the one read off the array (its dtype's whole range) is too wide.
+    channels:     name -> array or tensor [T + 1, ...], row t as a World renders it at frame t: `reward` and `done` are those
+                  of the step to frame t; row 0 has 0 and False. Memory-mapped arrays are read on demand.
+    actions:      [T, *action.shape], the action from frame t to t + 1, kept as `actions`.
+    action:       the action space; `imagine` checks its actions, and otherwise ignores them.
+    spaces_given: name -> space, where the default (the dtype's whole range) is too wide.
 
-    `done` is True on the last frame, and on any frame that the recording says so. Beyond the end the last frame
-    stays, with reward 0. Forks, and takes any batch. float16 and float64 channels are shown as float32.
-    Raises TerrellaError where the lengths do not agree.
+    `done` is True on the last frame, and where the recording says so. After the end the last frame stays, with reward 0.
+    The world is forkable, for any batch. float16 and float64 channels are shown as float32. TerrellaError where lengths differ.
     """
 
     def __init__(
@@ -62,19 +60,21 @@ class ReplayWorld:
         )
 
     def start(self, batch: int, rng: torch.Generator) -> State:
-        """`batch` times the first frame."""
+        """The first frame, `batch` times."""
         if batch < 1:
             raise TerrellaError(f"{self.spec.name} starts a batch of at least 1; got {batch}.")
         return State({"frame": torch.zeros(batch, dtype=torch.int64), "beyond": torch.zeros(batch, dtype=torch.bool)})
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """A recording takes no evidence: gives the prior, or the first frame."""
+        """The prior, or the first frame: a recording cannot be set from an observation."""
         if observation:
-            raise ObservationError(f"{self.spec.name} is a recording and takes no evidence; pass an empty mapping.")
+            raise ObservationError(
+                f"{self.spec.name} is a recording and accepts no observation; pass an empty mapping."
+            )
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """The next recorded frame. A frame that is done is not left."""
+        """The next recorded frame; a frame that is done stays."""
         self.spec.check_action(action, state.batch)
         done = self._done(state["frame"])
         return State({"frame": torch.where(done, state["frame"], state["frame"] + 1), "beyond": done})
@@ -101,7 +101,7 @@ class ReplayWorld:
 
 
 def _space_of(array: np.ndarray | torch.Tensor) -> spaces.Box:
-    """The widest space that holds rows of `array`."""
+    """The space of the whole range of the array's dtype."""
     row = np.asarray(array[:1])
     shape, dtype = row.shape[1:], row.dtype
     if dtype.kind == "b":

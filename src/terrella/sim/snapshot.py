@@ -1,8 +1,8 @@
-"""The Python state of a Gymnasium environment as plain numbers, and back: what makes a simulator forkable.
+"""Snapshots of the Python state of a Gymnasium environment as plain numbers, which make it forkable.
 
-A snapshot is taken of every attribute of the environment and its wrappers that is a number, None, a flat list or tuple
-of numbers, or a numeric array. Text and nested containers must stay what they were. Whatever holds anything else (a
-physics engine, an open file, a random generator of its own) is refused rather than copied by halves.
+A snapshot has every attribute of the environment and its wrappers that is a number, None, a flat list or tuple of numbers, or a
+numeric array. Text and nested containers must not change. An environment with any other attribute (a physics engine, an open
+file, its own random generator) is refused, because a copy would be incomplete.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from types import FunctionType
 import gymnasium
 import numpy as np
 
-# Gymnasium's own fields, which no dynamics depends on; the random stream is reseeded before every step.
+# Gymnasium's own fields, which do not affect the dynamics; the random generator is reseeded before every step.
 _IGNORED = {"env", "spec", "metadata", "_np_random", "_np_random_seed", "_saved_kwargs", "_cached_spec"}
 _IGNORED |= {"_action_space", "_observation_space", "_metadata"}
-_BYSTANDERS = (gymnasium.wrappers.PassiveEnvChecker, gymnasium.wrappers.OrderEnforcing)  # they only look on
+_CHECKERS = (gymnasium.wrappers.PassiveEnvChecker, gymnasium.wrappers.OrderEnforcing)  # without state of their own
 _LEAVES = (type(None), bool, int, float) + tuple(
     getattr(np, name) for name in "bool_ int8 int16 int32 int64 uint8 uint16 uint32 uint64 float32 float64".split()
 )
@@ -25,16 +25,16 @@ _CODE = {kind: code for code, kind in enumerate(_LEAVES)}
 _MAKE = (lambda number: None, bool, int, *_LEAVES[3:])
 _SCALAR, _TUPLE, _LIST, _ARRAY = range(4)
 _FIXED = (str, bytes, type, FunctionType, gymnasium.Space, np.dtype)
-_LARGEST_WHOLE = 2**53  # whole numbers up to here survive float64
-_MOST_NUMBERS = 100_000
+_MAX_INTEGER = 2**53  # float64 is exact up to here
+_MAX_NUMBERS = 100_000
 
 
 class NotCopyable(Exception):
-    """The environment holds something that numbers cannot say; the message names it."""
+    """The environment has state that is not made of numbers; the message names it."""
 
 
 class Snapshots:
-    """Takes and puts back snapshots of environments built alike; the layout is read from `env`, after a reset."""
+    """Takes and restores snapshots of environments made alike; the layout is that of `env` after a reset."""
 
     ignored = frozenset(_IGNORED)
 
@@ -54,22 +54,22 @@ class Snapshots:
                     self._fixed.append((depth, name, copy.deepcopy(value)))
                 else:
                     raise NotCopyable(f"`{name}` is a {type(value).__name__}")
-        if sum(width for _, _, width, _ in self._slots) > _MOST_NUMBERS:
-            raise NotCopyable(f"its state has more than {_MOST_NUMBERS:,} numbers")
+        if sum(width for _, _, width, _ in self._slots) > _MAX_NUMBERS:
+            raise NotCopyable(f"its state has more than {_MAX_NUMBERS:,} numbers")
 
     def take(self, env: gymnasium.Env) -> tuple[list[float], list[int]]:
-        """The numbers of the present, and the kinds (types) that turn them back into the attributes."""
+        """The numbers of the current state, and the types that turn them back into attributes."""
         layers, numbers, kinds = _layers(env), [], []
         for names, layer in zip(self._names, layers, strict=True):
             if len(layer) != len(names):
-                raise NotCopyable(f"it grew the attributes {sorted(set(layer) ^ names)}")
+                raise NotCopyable(f"it has new attributes {sorted(set(layer) ^ names)}")
         for depth, name, constant in self._fixed:
             if not _alike(layers[depth][name], constant, name):
                 raise NotCopyable(f"`{name}` changes and is not made of numbers")
         for depth, name, width, _ in self._slots:
             value = layers[depth][name]
             code = _CODE.get(type(value))
-            if code is not None and width == 1:  # a plain number, the usual case
+            if code is not None and width == 1:  # a single number, the usual case
                 container, leaves, codes = _SCALAR, (value,), (code,)
             else:
                 parts = _parts(value)
@@ -80,13 +80,13 @@ class Snapshots:
             kinds.append(container)
             kinds += codes
             for leaf in leaves:
-                if type(leaf) is int and abs(leaf) > _LARGEST_WHOLE:
-                    raise NotCopyable(f"`{name}` holds a whole number beyond 2**53")
+                if type(leaf) is int and abs(leaf) > _MAX_INTEGER:
+                    raise NotCopyable(f"`{name}` holds an integer beyond 2**53")
                 numbers.append(0.0 if leaf is None else float(leaf))
         return numbers, kinds
 
     def put(self, env: gymnasium.Env, numbers: Sequence[float], kinds: Sequence[int]) -> None:
-        """Makes `env` what the snapshot was taken of. What `env` made for drawing (a surface, a clock) stays."""
+        """Restores a snapshot in `env`. Objects that `env` made for rendering (a surface, a clock) stay."""
         layers, at, kind = _layers(env), 0, 0
         for depth, name, width, shape in self._slots:
             container, codes = kinds[kind], kinds[kind + 1 : kind + 1 + width]
@@ -104,15 +104,15 @@ class Snapshots:
 
 
 def _layers(env: gymnasium.Env) -> list[dict]:
-    """The attribute dictionaries of the wrappers, outermost first, and of the bare environment."""
+    """The attributes of the wrappers, outermost first, and of the bare environment."""
     chain = [env]
     while isinstance(chain[-1], gymnasium.Wrapper):
         chain.append(chain[-1].env)
-    return [vars(layer) for layer in chain if not isinstance(layer, _BYSTANDERS)]
+    return [vars(layer) for layer in chain if not isinstance(layer, _CHECKERS)]
 
 
 def _parts(value) -> tuple[int, list] | None:
-    """(container, leaves) of a value that numbers can say, else None."""
+    """(container, leaves) of a value made of numbers, else None."""
     if type(value) in _CODE:
         return _SCALAR, [value]
     if type(value) in (tuple, list) and all(type(leaf) in _CODE for leaf in value):
@@ -125,9 +125,9 @@ def _parts(value) -> tuple[int, list] | None:
 def _alike(value, constant, name: str) -> bool:
     if isinstance(value, np.ndarray):
         return isinstance(constant, np.ndarray) and np.array_equal(value, constant)
-    if isinstance(value, (gymnasium.Space, FunctionType)):  # each instance has its own
+    if isinstance(value, (gymnasium.Space, FunctionType)):  # instances differ, types do not
         return type(value) is type(constant)
     try:
         return type(value) is type(constant) and bool(value == constant)
-    except ValueError as error:  # arrays inside a container have no plain truth value
+    except ValueError as error:  # arrays in a container cannot be compared with ==
         raise NotCopyable(f"`{name}` keeps arrays inside a container") from error

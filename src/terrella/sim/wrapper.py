@@ -1,4 +1,4 @@
-"""What worlds around worlds share: the world inside, and closing it."""
+"""WorldWrapper: the base class of worlds around worlds."""
 
 from __future__ import annotations
 

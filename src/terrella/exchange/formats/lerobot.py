@@ -1,4 +1,4 @@
-"""LeRobot v3.0: a recording read as a Source, and any Source written as one, its rows by a stated clock and policy."""
+"""LeRobot v3.0: reads a dataset as a Source, and writes any Source as one, resampled to rows."""
 
 from __future__ import annotations
 
@@ -22,23 +22,20 @@ from . import rows
 
 
 def read(root: str | Path, fps: float | None = None) -> Source:
-    """A LeRobot v3.0 folder, or the address of one, which says its own fps."""
+    """A LeRobot v3.0 folder, or its address. `fps` is ignored: the dataset states its own."""
     return Dataset(root).source()
 
 
 @dataclass(frozen=True)
 class LeRobotRows:
-    """How a Source becomes rows.
+    """How a Source becomes rows."""
 
-    fps:      rows a second; None for the rows that the source has, or, where each sensor has its own clock, one row for
-              each reading of the fastest camera, else the fastest observation.
-    policy:   what a row holds of a sensor that has no reading at its time, as `resample` says; images and depth never
-              mix: "linear" means "nearest" for them.
-    pictures: "video" (H.264) or "png" (exact).
-    """
-
+    # Rows per second. None: the source's own rows; if each sensor has its own clock, a row per reading of the fastest camera,
+    # else of the fastest observation.
     fps: float | None = None
+    # A row's value of a sensor without a reading at that time, see `resample`. For images and depth, "linear" is "nearest".
     policy: Policy = "previous"
+    # "video" (H.264) or "png" (exact).
     pictures: Literal["video", "png"] = "video"
 
 
@@ -49,18 +46,18 @@ def write(
     how: LeRobotRows = LeRobotRows(),
     finish: Callable[[Path, list[str]], object] | None = None,
 ) -> list[str]:
-    """Writes every take as an episode of a new LeRobot v3.0 folder; returns sentences on what was changed or left out.
+    """Writes every take as an episode of a new LeRobot v3.0 folder; returns notes on what was changed or left out.
 
-    Sensors whose clocks are not the rows' are kept twice: resampled in the rows, where every LeRobot reader finds them,
-    and with their true times as streams; points are streams alone. `progress(takes, 0)` is called after each take;
-    `finish(folder, sentences)` may add files at the end, before the folder is moved to `root`.
+    A sensor with its own clock is stored twice: resampled in the rows, for every LeRobot reader, and with its true times as
+    a stream. Points are streams only. `progress(takes, 0)` is called after each take; `finish(folder, notes)` may add files
+    before the folder is moved to `root`.
     """
     root = Path(os.path.abspath(root))
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise DatasetError(f"{root} is not empty; convert into a new folder.")
     first = next(iter(source.takes()), None)
     if first is None:
-        raise DatasetError(f"{source.name} has no take; there is nothing to convert.")
+        raise DatasetError(f"{source.name} has no takes; choose another recording.")
     lead = _lead(source, first)
     layout, notes = _layout(source, first, lead, how)
     with creating(root) as staged:
@@ -71,7 +68,7 @@ def write(
         except DatasetError as error:
             if not isinstance(error.__cause__, OSError):
                 raise
-            raise not_written(root, error.__cause__) from error  # what the recorder calls safe goes with `staged`
+            raise not_written(root, error.__cause__) from error  # the recorder's error names `staged`, which is deleted
     return notes
 
 
@@ -96,12 +93,12 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRo
 
 
 def _lead(source: Source, first: Take) -> str:
-    there = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
-    if not there:
-        raise DatasetError(f"the first take of {source.name} has no readings at all.")
-    seen = [sensor for sensor in there if not is_outcome(sensor.name) and sensor.kind != "points"] or there
-    cameras = [sensor for sensor in seen if sensor.kind == "image"]
-    return max(cameras or seen, key=lambda sensor: len(first.readings[sensor.name].time_s)).name
+    present = [sensor for name, sensor in source.sensors.items() if len(first.readings.get(name, _NONE).time_s)]
+    if not present:
+        raise DatasetError(f"the first take of {source.name} has no readings; leave it out.")
+    observed = [sensor for sensor in present if not is_outcome(sensor.name) and sensor.kind != "points"] or present
+    cameras = [sensor for sensor in observed if sensor.kind == "image"]
+    return max(cameras or observed, key=lambda sensor: len(first.readings[sensor.name].time_s)).name
 
 
 _NONE = Readings(np.zeros(0), [])
@@ -112,7 +109,7 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
     rate = how.fps or source.fps or source.sensors[lead].rate_hz
     if rate is None:
         if len(at) < 2 or at[-1] <= at[0]:
-            raise DatasetError(f"{source.name} does not say how many frames a second it has; give --fps.")
+            raise DatasetError(f"{source.name} has no frame rate; give --fps.")
         rate = float(f"{(len(at) - 1) / (at[-1] - at[0]):.6g}")
     own_clocks = source.fps is None or (how.fps is not None and how.fps != source.fps)
     sensors, streams, pictures = {}, {}, how.pictures
@@ -124,17 +121,15 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
         )
         if sensor.kind == "image" and (sensor.shape[0] % 2 or sensor.shape[1] % 2) and pictures == "video":
             pictures = "png"
-            notes.append(
-                f"{name} is {sensor.shape[0]}x{sensor.shape[1]}, odd sizes are none for H.264: pictures are PNG"
-            )
+            notes.append(f"{name} is {sensor.shape[0]}x{sensor.shape[1]}, and H.264 needs even sizes: pictures are PNG")
         if sensor.kind != "points":
             sensors[name] = sensor
         if sensor.dtype == "string":
-            continue  # text that has a clock of its own is for the rows alone
+            continue  # text with its own clock is stored in the rows only
         if sensor.kind == "points" or (own_clocks or reserved) and (name != lead or how.fps):
             streams[name] = sensor
     if not sensors:
-        raise DatasetError(f"{source.name} has nothing but points, which no row can hold; add a camera or a pose.")
+        raise DatasetError(f"{source.name} has only points, which rows cannot hold; add a camera or a pose.")
     facts = dict(source.facts)
     world = facts.pop("world", {})
     layout = Layout(
@@ -147,10 +142,10 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
         world=world if isinstance(world, Mapping) else {},
         facts={**facts, "rows": {"lead": lead, "policy": how.policy, "fps_asked": how.fps}},
     )
-    films = {name for name, sensor in streams.items() if sensor.kind == "image" and pictures == "png"}
-    if films:
-        notes.append(f"{', '.join(sorted(films))}: kept in the rows alone, since pictures are PNG")
-        layout = replace(layout, streams={name: sensor for name, sensor in streams.items() if name not in films})
+    png_streams = {name for name, sensor in streams.items() if sensor.kind == "image" and pictures == "png"}
+    if png_streams:
+        notes.append(f"{', '.join(sorted(png_streams))}: kept in the rows only, because pictures are PNG")
+        layout = replace(layout, streams={name: sensor for name, sensor in streams.items() if name not in png_streams})
     return layout, notes
 
 
@@ -167,17 +162,17 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
     for name, sensor in layout.sensors.items():
         readings = take.readings.get(name, _NONE)
         place = _places(readings.time_s, at)
-        apart = len(readings.time_s) < len(at) - 1  # fewer than rows: only where the source has rows are they gaps
-        if len(readings.time_s) and place is not None and (not apart or (is_outcome(name) and has_rows)):
+        sparse = len(readings.time_s) < len(at) - 1  # these are gaps only if the source has rows
+        if len(readings.time_s) and place is not None and (not sparse or (is_outcome(name) and has_rows)):
             columns[name], _ = (readings.values, place), exact.add(name)
             continue
         columns[name] = _resampled(readings, sensor, at, how.policy)
         if len(readings.time_s) and not is_outcome(name) and columns[name][1][0] < 0:
             notes.append(f"rows before the first reading of {name} hold that first reading")
-    said = [(float(when), str(words)) for when, words in take.facts.get("language", ())]  # type: ignore[misc]
+    language = [(float(when), str(words)) for when, words in take.facts.get("language", ())]  # type: ignore[misc]
     for i, time_s in enumerate(at):
-        while said and said[0][0] <= time_s + SAME_TIME_S:
-            recorder.say(said.pop(0)[1])
+        while language and language[0][0] <= time_s + SAME_TIME_S:
+            recorder.say(language.pop(0)[1])
         row = {}
         for name, (values, place) in columns.items():
             if place[i] >= 0:
@@ -199,7 +194,7 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
 
 
 def _places(time_s: np.ndarray, at: np.ndarray) -> np.ndarray | None:
-    """int64 [T]: which reading is at each row's time, -1 for none; None where a reading is at no row's time."""
+    """int64 [T]: the reading at each row's time, -1 for none; None if some reading lies between rows."""
     row = np.abs(np.searchsorted(at, time_s - SAME_TIME_S)).clip(max=len(at) - 1)
     if len(np.unique(row)) != len(time_s) or (np.abs(at[row] - time_s) > SAME_TIME_S).any():
         return None
@@ -211,11 +206,11 @@ def _places(time_s: np.ndarray, at: np.ndarray) -> np.ndarray | None:
 def _resampled(
     readings: Readings, sensor: Sensor, at: np.ndarray, policy: Policy
 ) -> tuple[Sequence | np.ndarray, np.ndarray]:
-    """(values of T rows, int64 [T]: the row itself, or -1 where there is no value)."""
+    """(values of T rows, int64 [T]: the row's index, or -1 where it has no value)."""
     mixes = sensor.kind == "vector" and not is_outcome(sensor.name)
     held: Policy = "nearest" if policy == "linear" and not mixes else policy
     values, valid = resample(readings, sensor, at, held)
-    if is_outcome(sensor.name) and len(readings.time_s):  # an action lasts until the next; after the last there is none
+    if is_outcome(sensor.name) and len(readings.time_s):  # an action lasts until the next one, the last for one period
         period = np.median(np.diff(readings.time_s)) if len(readings.time_s) > 1 else 0.0
         valid = valid & (at < readings.time_s[-1] + max(period, SAME_TIME_S))
     return values, np.where(valid, np.arange(len(at)), -1)

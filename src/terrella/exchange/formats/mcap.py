@@ -210,7 +210,7 @@ class _File:
                     self._note(topic, "it has no messages")
                 continue
             try:
-                unpack = messages.foreign(name, schema.encoding, schema.data, encoding)
+                unpack = messages.unpacker(name, schema.encoding, schema.data, encoding)
             except DatasetError as error:
                 self._note(topic, f"its {len(selected.log_ns)} messages are left out: {error}")
                 continue

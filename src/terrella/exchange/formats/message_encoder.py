@@ -1,4 +1,4 @@
-"""One reading of a sensor as one of Foxglove's messages (Protobuf), made by Foxglove's own SDK."""
+"""Encodes sensor readings as Foxglove messages (Protobuf) with Foxglove's SDK."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _JPEG_QUALITY = 90
 
 
 class MessageEncoder:
-    """Makes messages of one sensor's readings; pictures become PNG (exact), or `jpeg`."""
+    """Encodes the readings of one sensor; pictures become PNG (exact), or JPEG if `jpeg`."""
 
     def __init__(self, sensor: Sensor, jpeg: bool = False):
         self._sensor = sensor
@@ -38,7 +38,7 @@ class MessageEncoder:
         self.schema, self._make = _vector_schema() if kind == "vector" else _SCHEMAS[kind](), getattr(self, f"_{kind}")
 
     def __call__(self, value: np.ndarray, time_ns: int) -> bytes:
-        """One message; DatasetError where the value is not what the sensor declares."""
+        """One message; DatasetError where the value differs from the sensor's declaration."""
         return self._make(checked(self._sensor, value), fox.Timestamp(time_ns // 10**9, time_ns % 10**9))
 
     def _picture(self, time: fox.Timestamp, data: bytes, format: str) -> bytes:
@@ -114,7 +114,7 @@ calibration_schema = fox.CameraCalibration.get_schema
 
 
 def checked(sensor: Sensor, value: Any) -> np.ndarray:
-    """The value as an array of the sensor's shape and dtype; DatasetError where it has another."""
+    """The value as an array; DatasetError where its shape or dtype differs from the sensor's."""
     value = np.asarray(value)
     if sensor.kind == "points":
         fits = value.ndim == 2 and value.shape[1:] == tuple(sensor.shape[1:])
@@ -127,7 +127,7 @@ def checked(sensor: Sensor, value: Any) -> np.ndarray:
 
 
 def calibration(sensor: Sensor, time_ns: int) -> bytes | None:
-    """A CameraCalibration of facts["calibration"] as `read` puts it there; None where it is of another form."""
+    """A CameraCalibration message of facts["calibration"], in the form that `mcap.read` gives it; else None."""
     value = sensor.facts.get("calibration")
     if not isinstance(value, Mapping) or len(value.get("K") or ()) != 9:
         return None
@@ -151,9 +151,9 @@ def _place(value: np.ndarray) -> tuple[fox.Vector3, fox.Quaternion]:
 
 @cache
 def _vector_file() -> Any:
-    """terrella.Vector {timestamp, values, names, integers}: Foxglove has no message for a named row of numbers.
+    """terrella.Vector {timestamp, values, names, integers}, because Foxglove has no message for a named vector.
 
-    `integers` repeats the values of 64-bit integers, which a double cannot hold.
+    `integers` repeats the values of 64-bit integers, which doubles would round.
     """
     kind = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="terrella/Vector.proto", package="terrella", syntax="proto3")

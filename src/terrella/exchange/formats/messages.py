@@ -31,16 +31,16 @@ CALIBRATION = "foxglove.CameraCalibration"
 TRANSFORM, TRANSFORMS = "foxglove.FrameTransform", "foxglove.FrameTransforms"
 VIDEO = "foxglove.CompressedVideo"
 MAX_NUMBERS = 2**16  # in one vector
-_DEEPEST = 16  # levels of nesting that are looked into
+_MAX_DEPTH = 16  # levels of nested fields that are read
 _POINT_TYPES = {i + 1: np.dtype(name) for i, name in enumerate(("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"))}
 _COLOUR = {"rgb8": (3, (0, 1, 2)), "bgr8": (3, (2, 1, 0)), "8UC3": (3, (2, 1, 0)), "mono8": (1, (0, 0, 0))}
 _COLOUR |= {"8UC1": (1, (0, 0, 0)), "rgba8": (4, (0, 1, 2)), "bgra8": (4, (2, 1, 0))}
 _CLOCK = ("google.protobuf.Timestamp", "google.protobuf.Duration")
-_NOT_NUMBERS = ("timestamp", "stamp", "header")  # of a message that nobody declared: its time, not its values
+_NOT_NUMBERS = ("timestamp", "stamp", "header")  # fields of an undeclared message that hold its time
 
 
-def foreign(schema_name: str, schema_encoding: str, schema: bytes, message_encoding: str) -> Callable[[bytes], dict]:
-    """How to unpack the messages of a file's own schema; DatasetError where that cannot be done."""
+def unpacker(schema_name: str, schema_encoding: str, schema: bytes, message_encoding: str) -> Callable[[bytes], dict]:
+    """A function that unpacks messages of a file's schema into fields; DatasetError where the schema cannot be used."""
     if message_encoding == "json":
         return unpack_json
     if message_encoding != "protobuf" or schema_encoding != "protobuf":
@@ -48,7 +48,7 @@ def foreign(schema_name: str, schema_encoding: str, schema: bytes, message_encod
         raise DatasetError(f"its messages are '{coding}' ({schema_name}), and only JSON and Protobuf are read")
     try:
         return _unpack_with(_class_in(schema_name, schema))
-    except Exception as error:  # whatever the library makes of a stranger's descriptors
+    except Exception as error:  # the library fails in many ways on foreign descriptors
         raise DatasetError(f"its Protobuf schema '{schema_name}' cannot be used ({error})") from error
 
 
@@ -56,9 +56,9 @@ def unpack_json(data: bytes) -> dict[str, Any]:
     try:
         fields = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"it is no JSON ({error})") from error
+        raise DatasetError(f"it is not JSON ({error})") from error
     if not isinstance(fields, dict):
-        raise DatasetError("it is no JSON object")
+        raise DatasetError("it is not a JSON object")
     return fields
 
 
@@ -68,14 +68,14 @@ def _unpack_with(cls: Any) -> Callable[[bytes], dict[str, Any]]:
         try:
             message.ParseFromString(data)
             return _plain(message)
-        except Exception as error:  # DecodeError, and whatever else hostile bytes bring up
-            raise DatasetError(f"it is no {cls.DESCRIPTOR.full_name} ({error})") from error
+        except Exception as error:  # DecodeError, and other errors from hostile bytes
+            raise DatasetError(f"it is not a {cls.DESCRIPTOR.full_name} ({error})") from error
 
     return unpack
 
 
 def _plain(message: Any) -> dict[str, Any]:
-    """The message's fields by name; an unset message within is left out, since its type may hold itself."""
+    """The message's fields by name, without unset inner messages, whose types may be recursive."""
     if message.DESCRIPTOR.full_name in _CLOCK:
         return {"sec": message.seconds, "nsec": message.nanos}
     fields = {}
@@ -94,7 +94,7 @@ def _plain(message: Any) -> dict[str, Any]:
 
 
 def _class_in(schema_name: str, schema: bytes) -> Any:
-    """The class of a message that a FileDescriptorSet describes, in a pool of its own."""
+    """The class of a message in a FileDescriptorSet, in its own descriptor pool."""
     pool = descriptor_pool.DescriptorPool()
     waiting = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file}
 
@@ -111,40 +111,36 @@ def _class_in(schema_name: str, schema: bytes) -> Any:
 
 @dataclass(frozen=True)
 class Reading:
-    """What one message shows.
-
-    by_path:  whether its names are the paths of its fields, of which another message may have others.
-    left_out: what of it is not in `value`, fields that are no numbers above all.
-    """
+    """The sensor reading in one message."""
 
     kind: Kind
     value: np.ndarray
     names: tuple[str, ...] = ()
     frame: str = ""
     facts: Mapping[str, object] = field(default_factory=dict)
-    by_path: bool = False
-    left_out: tuple[str, ...] = ()
+    by_path: bool = False  # the names are paths of fields, and may differ between messages
+    left_out: tuple[str, ...] = ()  # parts of the message that `value` does not hold, such as text fields
 
 
 def decode(schema_name: str, fields: Mapping[str, Any]) -> Reading:
-    """The reading that a message holds (video and transforms apart); DatasetError with the reason where it is broken."""
+    """The reading in a message other than video and transforms; DatasetError where it is broken."""
     try:
         return _DECODERS.get(schema_name, _numbers)(fields)
     except DatasetError:
         raise
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise DatasetError(f"it is no valid {schema_name} ({type(error).__name__}: {error})") from error
+        raise DatasetError(f"it is not a valid {schema_name} ({type(error).__name__}: {error})") from error
 
 
 def fit(reading: Reading, sensor: Sensor) -> np.ndarray:
-    """The reading as an array of the sensor's shape and dtype; numbers that it lacks become NaN."""
+    """The reading as an array of the sensor's shape and dtype; missing numbers become NaN."""
     value = reading.value
     if reading.kind != sensor.kind:
         raise DatasetError(f"it shows {reading.kind} where '{sensor.name}' is {sensor.kind}")
     if sensor.kind == "vector":
         if reading.names != sensor.names and reading.by_path:
-            found = dict(zip(reading.names, value.tolist()))
-            value = np.array([found.get(name, math.nan) for name in sensor.names])
+            numbers = dict(zip(reading.names, value.tolist()))
+            value = np.array([numbers.get(name, math.nan) for name in sensor.names])
         if value.size != math.prod(sensor.shape):
             raise DatasetError(f"it has {value.size} numbers where '{sensor.name}' has {math.prod(sensor.shape)}")
         target = np.dtype(sensor.dtype)
@@ -159,14 +155,14 @@ def fit(reading: Reading, sensor: Sensor) -> np.ndarray:
 
 
 def calibration_of(fields: Mapping[str, Any]) -> dict[str, object]:
-    """What facts["calibration"] holds: width, height, distortion_model, D, K, R, P and frame_id, as Foxglove names them."""
+    """facts["calibration"]: width, height, distortion_model, D, K, R, P and frame_id, as Foxglove names them."""
     try:
-        found: dict[str, object] = {name: int(fields.get(name) or 0) for name in ("width", "height")}
-        found["distortion_model"] = str(fields.get("distortion_model") or "")
-        found |= {name: [float(number) for number in fields.get(name) or ()] for name in ("D", "K", "R", "P")}
-        return found | {"frame_id": str(fields.get("frame_id") or "")}
+        values: dict[str, object] = {name: int(fields.get(name) or 0) for name in ("width", "height")}
+        values["distortion_model"] = str(fields.get("distortion_model") or "")
+        values |= {name: [float(number) for number in fields.get(name) or ()] for name in ("D", "K", "R", "P")}
+        return values | {"frame_id": str(fields.get("frame_id") or "")}
     except (TypeError, ValueError, OverflowError) as error:
-        raise DatasetError(f"it is no valid {CALIBRATION} ({error})") from error
+        raise DatasetError(f"it is not a valid {CALIBRATION} ({error})") from error
 
 
 def transforms_of(schema_name: str, fields: Mapping[str, Any]) -> Iterator[tuple[str, str, np.ndarray]]:
@@ -176,7 +172,7 @@ def transforms_of(schema_name: str, fields: Mapping[str, Any]) -> Iterator[tuple
             value = _joined(item.get("translation"), item.get("rotation"))
             yield str(item.get("parent_frame_id") or ""), str(item.get("child_frame_id") or ""), value
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise DatasetError(f"it is no valid {schema_name} ({error})") from error
+        raise DatasetError(f"it is not a valid {schema_name} ({error})") from error
 
 
 def video_of(fields: Mapping[str, Any]) -> tuple[str, bytes]:
@@ -200,7 +196,7 @@ def _compressed_image(fields: Mapping[str, Any]) -> Reading:
                 return Reading("depth", rows.metres(np.asarray(picture)), frame=frame)
             return Reading("image", np.asarray(picture.convert("RGB")), frame=frame)
     except rows.PICTURE_ERRORS as error:
-        raise DatasetError(f"its picture is no whole JPEG, PNG or WebP ({error})") from error
+        raise DatasetError(f"its picture is not a valid JPEG, PNG or WebP ({error})") from error
 
 
 def _raw_image(fields: Mapping[str, Any]) -> Reading:
@@ -225,7 +221,7 @@ def _raw_image(fields: Mapping[str, Any]) -> Reading:
 def _point_cloud(fields: Mapping[str, Any]) -> Reading:
     data, stride, columns = _bytes(fields), int(fields["point_stride"]), list(fields["fields"])
     if not 0 < stride <= 2**16 or not columns or len(columns) > 256 or len(data) % stride:
-        raise DatasetError(f"its {len(data)} bytes are no points of {stride} bytes and {len(columns)} fields")
+        raise DatasetError(f"its {len(data)} bytes do not hold points of {stride} bytes and {len(columns)} fields")
     count, values, names = len(data) // stride, [], []
     for column in columns:
         kind, offset = _POINT_TYPES.get(int(column.get("type") or 0)), int(column.get("offset") or 0)
@@ -242,10 +238,10 @@ def _point_cloud(fields: Mapping[str, Any]) -> Reading:
         place = _joined(pose.get("position"), pose.get("orientation"))
         if place.any() and not np.array_equal(place, [0, 0, 0, 1, 0, 0, 0]):
             facts["pose_in_frame"] = dict(zip(POSE_NAMES, place.tolist()))
-    longer = tuple(
+    rounded = tuple(
         f"all digits of '{name}'" for name, column in zip(names, columns) if int(column["type"]) in (5, 6, 8)
     )
-    return Reading("points", points, tuple(names), str(fields.get("frame_id") or ""), facts, left_out=longer)
+    return Reading("points", points, tuple(names), str(fields.get("frame_id") or ""), facts, left_out=rounded)
 
 
 def _pose(fields: Mapping[str, Any]) -> Reading:
@@ -262,7 +258,7 @@ def _vector(fields: Mapping[str, Any]) -> Reading:
 
 
 def _numbers(fields: Mapping[str, Any]) -> Reading:
-    """Any message at all: its numbers by the path of their field."""
+    """A message of any other type: its numbers, named by the paths of their fields."""
     numbers: dict[str, float] = {}
     left_out: list[str] = []
 
@@ -273,7 +269,7 @@ def _numbers(fields: Mapping[str, Any]) -> Reading:
             numbers[path] = float(value)
         elif value in ("NaN", "Infinity", "-Infinity"):
             numbers[path] = float(value)
-        elif isinstance(value, (dict, list)) and depth < _DEEPEST:
+        elif isinstance(value, (dict, list)) and depth < _MAX_DEPTH:
             for name, item in _items(value):
                 gather(f"{path}.{name}" if path else name, item, depth + 1)
         elif len(left_out) < 8:
@@ -289,7 +285,7 @@ def _numbers(fields: Mapping[str, Any]) -> Reading:
 
 
 def _items(value: dict | list) -> Iterator[tuple[str, Any]]:
-    """Fields by name; of a list by number, or by the "name" of each where all have one of their own."""
+    """Fields by name; items of a list by index, or by their "name" if each has a unique one."""
     if isinstance(value, dict):
         yield from ((str(name), item) for name, item in value.items())
         return
@@ -307,9 +303,9 @@ def _bytes(fields: Mapping[str, Any]) -> bytes:
         try:
             return base64.b64decode(data, validate=True)
         except (binascii.Error, ValueError) as error:
-            raise DatasetError(f"its data are no base64 ({error})") from error
+            raise DatasetError(f"its data are not base64 ({error})") from error
     if not isinstance(data, bytes):
-        raise DatasetError("its data are no bytes")
+        raise DatasetError("its data are not bytes")
     return data
 
 

@@ -1,4 +1,4 @@
-"""Hands a recording to Rerun (https://rerun.io), whose viewer shows it."""
+"""Shows a recording in the viewer of Rerun (https://rerun.io)."""
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -18,25 +18,24 @@ try:
 except ImportError as error:
     raise DatasetError("Rerun needs a package that is not installed: pip install 'terrella[rerun]'.") from error
 
-_QUALITY = 90  # of JPEG pictures
-_PATIENCE_S = 60.0  # for the viewer to take in one episode
+_JPEG_QUALITY = 90
+_FLUSH_TIMEOUT_S = 60.0  # for one episode
 
 
 def show(source: Source) -> list[str]:
-    """Sends all takes to Rerun's viewer, which is opened on this machine; returns what Rerun has no place for.
+    """Opens Rerun's viewer on this machine and sends it all takes; returns notes on what Rerun cannot show.
 
-    Pictures become JPEG, depth has 0 where nothing was hit; each sensor keeps its own times (timeline "time", seconds
-    since the take began; "wall_time" where that is known). Units and frames of coordinates are left out. DatasetError
-    where there is no viewer.
+    Pictures become JPEG; depth is 0 where nothing was hit. Each sensor keeps its own times (timeline "time", seconds since
+    the start of the take; "wall_time" where known). Units and coordinate frames are left out. DatasetError without a viewer.
     """
     for number, take in enumerate(source.takes()):
         stream = _stream(source, number)
         try:
             with _reached():
-                stream.spawn()  # joins the viewer that is already open, if any
+                stream.spawn()  # uses a viewer that is already open
             _log(stream, source, take)
             with _reached():
-                stream.flush(timeout_sec=_PATIENCE_S)
+                stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         finally:
             stream.disconnect()
     return _left_out(source)
@@ -48,7 +47,7 @@ def _reached() -> Iterator[None]:
         yield
     except (RuntimeError, ValueError, OSError) as error:
         raise DatasetError(
-            f"a viewer of Rerun cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`."
+            f"Rerun's viewer cannot be reached ({str(error).splitlines()[0]}); start one with `rerun`."
         ) from error
 
 
@@ -83,7 +82,7 @@ def _log(stream: rr.RecordingStream, source: Source, take: Take) -> None:
 
 def _shown(sensor: Sensor, value: np.ndarray) -> rr.AsComponents:
     if sensor.kind == "image":
-        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(value), quality=_QUALITY, colorspace="RGB")
+        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(value), quality=_JPEG_QUALITY, colorspace="RGB")
         return rr.EncodedImage(contents=jpeg, media_type="image/jpeg")
     if sensor.kind == "depth":
         return rr.DepthImage(np.where(np.isfinite(value), value, 0).astype(np.float32), meter=1.0)

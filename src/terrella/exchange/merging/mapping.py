@@ -1,4 +1,4 @@
-"""The mapping of a merge: which number of which robot fills which named number of the merged set, and what must hold of it."""
+"""The mapping of a merge: which number of each robot fills which merged number; and its checks."""
 
 from __future__ import annotations
 
@@ -17,26 +17,19 @@ from .units import convert
 ACTION = "action"
 STATE = "observation.state"
 CAMERAS_MASK, EMBODIMENT = "observation.cameras_mask", "embodiment"
-NAME = re.compile(r"\w[\w.-]*")  # of a sensor that any format can hold
-FOLLOWS = "next."  # next.reward, next.done, …: what followed a row
+NAME = re.compile(r"\w[\w.-]*")  # a sensor name that every format can store
+FOLLOWS = "next."  # next.reward, next.done, …: outcomes of a row
 
 
 @dataclass(frozen=True)
 class MergeRows:
-    """How the merged rows are made.
+    """How the merged rows are made."""
 
-    fps:        rows a second.
-    images:     policy for images, depth and points.
-    continuous: policy for the numbers that are observed.
-    actions:    policy for actions.
-    max_gap_s:  a row has no value from a sensor that was silent for longer; None for no limit.
-    """
-
-    fps: float
-    images: Literal["previous", "nearest"] = "previous"
-    continuous: Policy = "linear"
-    actions: Policy = "previous"
-    max_gap_s: float | None = 1.0
+    fps: float  # rows per second
+    images: Literal["previous", "nearest"] = "previous"  # policy for images, depth and points
+    continuous: Policy = "linear"  # policy for observed numbers
+    actions: Policy = "previous"  # policy for actions
+    max_gap_s: float | None = 1.0  # longer gaps of a sensor are masked; None for no limit
 
 
 @dataclass(frozen=True)
@@ -60,8 +53,8 @@ class MergedCamera:
 class Number:
     """One number of a sensor: it fills the dimension `to`, or is left out for the reason `out`.
 
-    Where `scale` is None the number is converted from `unit` to the dimension's unit (if both are stated), else the
-    dimension is filled with scale * number + offset.
+    The dimension is scale * number + offset. If `scale` is None, the number is converted from `unit` to the dimension's unit,
+    where both are stated.
     """
 
     name: str = ""
@@ -74,7 +67,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Vector:
-    """One sensor's numbers in their order, and the frame that they are in."""
+    """One sensor's numbers in order, and their coordinate frame."""
 
     numbers: tuple[Number, ...]
     frame: str = ""
@@ -82,31 +75,23 @@ class Vector:
 
 @dataclass(frozen=True)
 class SourceMapping:
-    """Where one source's sensors go.
+    """Where one source's sensors go."""
 
-    path:       where the source lies, the key under which `merge` is given it.
-    embodiment: name of the robot; sources of one embodiment share their statistics.
-    fps:        rows a second of the source itself, None where each sensor has a clock of its own.
-    vectors:    sensor -> its numbers; "action" fills the merged action, every other one the merged state.
-    cameras:    sensor (image or depth) -> merged camera.
-    keep:       sensor (points, next.reward, a wide vector, …) -> the name under which it is kept whole.
-    out:        sensor -> why it is left out.
-    notes:      what a person should look at.
-    """
-
-    path: str
-    embodiment: str
-    fps: float | None = None
+    path: str  # of the source, and its key in `merge`
+    embodiment: str  # name of the robot; sources of one embodiment share their statistics
+    fps: float | None = None  # rows per second of the source, None where each sensor has its own clock
+    # sensor -> its numbers; "action" fills the merged action, every other sensor the merged state
     vectors: Mapping[str, Vector] = field(default_factory=dict)
-    cameras: Mapping[str, str] = field(default_factory=dict)
+    cameras: Mapping[str, str] = field(default_factory=dict)  # sensor (image or depth) -> merged camera
+    # sensor (points, next.reward, a wide vector, …) -> the name under which it is kept whole
     keep: Mapping[str, str] = field(default_factory=dict)
-    out: Mapping[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    out: Mapping[str, str] = field(default_factory=dict)  # sensor -> why it is left out
+    notes: tuple[str, ...] = ()  # guesses that a person should check
 
 
 @dataclass(frozen=True)
 class MergeMapping:
-    """The whole file. Merged numbers and cameras come in the order in which they stand here."""
+    """The whole mapping. Merged numbers and cameras keep the order of these tables."""
 
     rows: MergeRows
     action: Mapping[str, Dimension]
@@ -120,16 +105,16 @@ class MergeMapping:
 
     @property
     def embodiments(self) -> tuple[str, ...]:
-        """Each once, in the order of the sources: its place is its number in the merged set."""
+        """The robots in the order of the sources; the index of one is its number in the merged set."""
         return tuple(dict.fromkeys(source.embodiment for source in self.sources))
 
 
 def mask_of(sensor: str) -> str:
-    """The name of the bool vector that says which of a merged sensor's numbers (or whether a kept one) are there."""
+    """The name of the mask of a merged sensor's numbers, or of a sensor that is kept whole."""
     return f"{sensor}_mask"
 
 
-MADE = (ACTION, mask_of(ACTION), STATE, mask_of(STATE), CAMERAS_MASK, EMBODIMENT)  # by every merge
+MERGED = (ACTION, mask_of(ACTION), STATE, mask_of(STATE), CAMERAS_MASK, EMBODIMENT)  # sensors of every merge
 
 
 def affine(number: Number, dimension: Dimension) -> tuple[float, float]:
@@ -141,18 +126,18 @@ def affine(number: Number, dimension: Dimension) -> tuple[float, float]:
 
 
 def check_inside(mapping: MergeMapping) -> None:
-    """What must hold whatever the sources are."""
-    taken = set(MADE) | set(mapping.cameras)
+    """Checks what does not depend on the sources; DatasetError where it does not hold."""
+    taken = set(MERGED) | set(mapping.cameras)
     for what, value in (("fps", mapping.rows.fps), ("max_gap_s", mapping.rows.max_gap_s)):
         _check_positive(value, f"[rows] {what}")
     for name, camera in mapping.cameras.items():
         if not (0 < camera.height <= MAX_SIDE and 0 < camera.width <= MAX_SIDE):
             size = f"{camera.height} x {camera.width}"
             raise DatasetError(f"[cameras] '{name}' is {size}; give 1 to {MAX_SIDE} pixels each way.")
-        if not name.startswith("observation.") or name in MADE or not NAME.fullmatch(name):
+        if not name.startswith("observation.") or name in MERGED or not NAME.fullmatch(name):
             raise DatasetError(
                 f"[cameras] '{name}' must begin with 'observation.', have only letters, digits, '.', '_' and '-', and be "
-                f"none of {', '.join(MADE)}."
+                f"none of {', '.join(MERGED)}."
             )
     for to in {to for source in mapping.sources for to in source.keep.values()}:
         if {to, mask_of(to)} & taken or not to.startswith(("observation.", FOLLOWS)) or not NAME.fullmatch(to):
@@ -200,7 +185,7 @@ def _check_numbers(mapping: MergeMapping, source: SourceMapping, where: str) -> 
                 if not math.isfinite(value):
                     raise DatasetError(f"{this} {key} = {value} must be finite.")
             if number.scale == 0:
-                raise DatasetError(f"{this} has scale 0, which keeps nothing of it; give `out` and why instead.")
+                raise DatasetError(f"{this} has scale 0, which erases it; give `out` with a reason instead.")
             if number.out:
                 continue
             if number.to not in dimensions:
@@ -211,8 +196,8 @@ def _check_numbers(mapping: MergeMapping, source: SourceMapping, where: str) -> 
             dimension = dimensions[number.to]
             if vector.frame and dimension.frame and vector.frame != dimension.frame:
                 raise DatasetError(
-                    f"{this} is in the frame '{vector.frame}' and '{number.to}' in '{dimension.frame}'; only a person "
-                    "can say that these are one: give both one name, or give it a dimension of its own."
+                    f"{this} is in the frame '{vector.frame}' and '{number.to}' in '{dimension.frame}'; give both the same "
+                    "name if they are the same frame, or give the number its own dimension."
                 )
             try:
                 affine(number, dimension)
@@ -221,15 +206,13 @@ def _check_numbers(mapping: MergeMapping, source: SourceMapping, where: str) -> 
 
 
 def check_mapping(mapping: MergeMapping, sources: Mapping[str, Source]) -> None:
-    """DatasetError where the mapping speaks of what the sources do not have (a path, a sensor, a number, another kind), or
-    not of a source at all.
-    """
+    """DatasetError where the mapping and the sources do not match: paths, sensors, numbers, kinds."""
     check_inside(mapping)
     kept: dict[str, tuple] = {}
     for count, source in enumerate(mapping.sources, 1):
         where = f"source {count} ({source.embodiment})"
         if source.path not in sources:
-            raise DatasetError(f"{where} has the path '{source.path}'; given were {', '.join(sources)}.")
+            raise DatasetError(f"{where} has the path '{source.path}'; the given sources are {', '.join(sources)}.")
         sensors = sources[source.path].sensors
         for table in ("vectors", "cameras", "keep", "out"):
             for name in getattr(source, table):
@@ -259,17 +242,19 @@ def check_mapping(mapping: MergeMapping, sources: Mapping[str, Source]) -> None:
                 raise DatasetError(f"{where} keep: '{name}' is of kind {sensor.kind}; put it under cameras.")
             if sensor.dtype == "string" or (name.startswith(FOLLOWS) and sensor.shape != (1,)):
                 raise DatasetError(
-                    f"{where} keep: '{name}' is {sensor.dtype} of shape {sensor.shape}; text cannot be kept, nor, of what "
-                    "followed, more than one number."
+                    f"{where} keep: '{name}' is {sensor.dtype} of shape {sensor.shape}; text cannot be kept, nor an "
+                    f"outcome ({FOLLOWS}…) of more than one number."
                 )
             if name == ACTION or name.startswith(FOLLOWS) != to.startswith(FOLLOWS):
                 raise DatasetError(
-                    f"{where} keep: '{name}' cannot be kept as '{to}'; begin both with '{FOLLOWS}' or none."
+                    f"{where} keep: '{name}' cannot be kept as '{to}'; begin both or neither with '{FOLLOWS}'."
                 )
             form = (sensor.kind, sensor.shape, sensor.dtype, sensor.names)
             form = form[:2] if name.startswith(FOLLOWS) else form
             if kept.setdefault(to, form) != form:
-                raise DatasetError(f"{where} keep: '{name}' has another form than what else fills '{to}'; rename one.")
+                raise DatasetError(
+                    f"{where} keep: '{name}' differs in shape or dtype from others kept as '{to}'; rename one."
+                )
     for path in sources:
         if path not in {source.path for source in mapping.sources}:
             raise DatasetError(f"the mapping has no [[source]] with the path '{path}'; add one, or leave that out.")

@@ -1,4 +1,4 @@
-"""The mapping of a merge as a TOML file that explains itself, for a person to edit."""
+"""The mapping of a merge as a commented TOML file, for a person to edit."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from tomlkit.items import InlineTable, Table
 from ...core.errors import DatasetError
 from .mapping import MergeMapping, Number, SourceMapping, check_inside
 
-_TOP = "Which number of which robot goes where in the merged recording. Edit it and merge again with this file."
+_TOP = "Where each number of each robot goes in the merged recording. Edit this file and merge again with it."
 _ROWS = {
-    "fps": "rows a second of the merged recording",
-    "images": "images, depth, points: previous (the newest not later than the row) or nearest",
+    "fps": "rows per second of the merged recording",
+    "images": "images, depth, points: previous (the newest one up to the row) or nearest",
     "continuous": "observed numbers: linear (between two readings), previous or nearest",
-    "actions": "actions: previous (what was being done), nearest or linear",
-    "max_gap_s": "longer silences of a sensor, in seconds, are masked; without this line none are",
+    "actions": "actions: previous (the one being executed), nearest or linear",
+    "max_gap_s": "longer gaps of a sensor, in seconds, are masked; without this line none are",
 }
-_DIMENSIONS = "The merged numbers, in order. A robot that lacks one has 0 there and False in the mask."
-_CAMERAS = 'The merged cameras: kind "image" or "depth"; pictures are fitted into height x width pixels, aspect kept.'
+_DIMENSIONS = "The merged numbers, in order. Where a robot lacks one, the value is 0 and the mask False."
+_CAMERAS = 'The merged cameras: kind "image" or "depth"; pictures are letterboxed into height x width pixels.'
 _SOURCE = {
     "cameras": "its camera = merged camera",
     "keep": "kept whole: its sensor = merged sensor",
@@ -37,7 +37,7 @@ _NUMBERS = (
 
 
 def write_mapping(mapping: MergeMapping, path: str | Path) -> None:
-    """Writes the file with a comment on each part; `read_mapping` gives the same back."""
+    """Writes the mapping with a comment on each part; `read_mapping` is the inverse."""
     try:
         Path(path).write_text(to_toml(mapping), encoding="utf-8", newline="\n")
     except (OSError, UnicodeEncodeError) as error:
@@ -80,7 +80,7 @@ def _table(values: Mapping[str, Any], *comments: str) -> Table:
 
 
 def _inline(item: Any) -> InlineTable:
-    """A dataclass as { key = value, … }, without what is as by default."""
+    """A dataclass as { key = value, … }, without default values."""
     inline = tomlkit.inline_table()
     for field in fields(item):
         value = getattr(item, field.name)
@@ -94,9 +94,9 @@ def _source(mapping: MergeMapping, source: SourceMapping) -> Table:
     table["embodiment"].comment("sources of one embodiment share their statistics")
     if source.fps is not None:
         table.add("fps", source.fps)
-        table["fps"].comment("its own rows a second")
+        table["fps"].comment("its own rows per second")
     if source.notes:
-        table.add(tomlkit.comment("look at these"))
+        table.add(tomlkit.comment("check these"))
         table.add("notes", _lines((note, "") for note in source.notes))
     for key, words in _SOURCE.items():
         if getattr(source, key):
@@ -104,10 +104,10 @@ def _source(mapping: MergeMapping, source: SourceMapping) -> Table:
     if source.vectors:
         vectors = tomlkit.table(is_super_table=True)
         for name, vector in source.vectors.items():
-            found = _table({"frame": vector.frame} if vector.frame else {}, *_NUMBERS)
+            part = _table({"frame": vector.frame} if vector.frame else {}, *_NUMBERS)
             units = {to: it.unit for to, it in mapping.dimensions(name).items()}
-            found.add("numbers", _lines((_inline(it), _converted(it, units.get(it.to, ""))) for it in vector.numbers))
-            vectors.add(name, found)
+            part.add("numbers", _lines((_inline(it), _converted(it, units.get(it.to, ""))) for it in vector.numbers))
+            vectors.add(name, part)
         table.add("vectors", vectors)
     return table
 
@@ -127,14 +127,14 @@ def _lines(items: Any) -> Any:
 
 
 def read_mapping(path: str | Path) -> MergeMapping:
-    """Reads a mapping file. DatasetError names the place of whatever is wrong in it: a slip of TOML by its line, else by
-    key: an unknown or missing one, a value of the wrong type, a number mapped twice or to a dimension that does not
-    exist, units or frames that do not agree. What it says of the sources is compared with them by `check_mapping`.
+    """Reads a mapping file. DatasetError names the line of a TOML error, or the key of any other: an unknown or missing key,
+    a value of the wrong type, a number mapped twice or to an unknown dimension, units or frames that do not match. The
+    sources themselves are compared with it by `check_mapping`.
     """
     try:
         tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise DatasetError(f"there is no mapping to read at {path} ({error.strerror}).") from error
+        raise DatasetError(f"the mapping {path} cannot be read ({error.strerror}); check the path.") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
         raise DatasetError(f"{path} is not TOML ({error}); mend it there.") from error
     try:
@@ -146,7 +146,7 @@ def read_mapping(path: str | Path) -> MergeMapping:
 
 
 def mapping_of(tables: dict) -> MergeMapping:
-    """The mapping that parsed TOML holds; DatasetError where a key is unknown or missing, or a value of another type."""
+    """The mapping in parsed TOML; DatasetError where a key is unknown or missing, or a value has the wrong type."""
     sources = tables.get("source", [])
     if not isinstance(sources, list) or not sources:
         raise DatasetError("it has no [[source]] tables; add one for each recording to merge.")
@@ -158,8 +158,8 @@ def mapping_of(tables: dict) -> MergeMapping:
     given = {**dict.fromkeys(known, {}), **tables}
     if isinstance(given["rows"], dict):
         given["rows"] = {"max_gap_s": None, **given["rows"]}
-    found = {key: _value(hints[key], given[key], f"[{key}]") for key in known}
-    return MergeMapping(**found, sources=tuple(_read_source(it, f"source {i}") for i, it in enumerate(sources, 1)))
+    values = {key: _value(hints[key], given[key], f"[{key}]") for key in known}
+    return MergeMapping(**values, sources=tuple(_read_source(it, f"source {i}") for i, it in enumerate(sources, 1)))
 
 
 def _read_source(values: Any, where: str) -> SourceMapping:
@@ -168,7 +168,7 @@ def _read_source(values: Any, where: str) -> SourceMapping:
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    """What TOML has of that type; DatasetError where it is another, or (of a table) has an unknown key or lacks one."""
+    """A TOML value as that type; DatasetError where the type is wrong, or a table has an unknown or missing key."""
     origin, parts = get_origin(hint), get_args(hint)
     if NoneType in parts:
         return None if value is None else _value(parts[0], value, where)

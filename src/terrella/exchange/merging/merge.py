@@ -1,24 +1,23 @@
-"""merge: several robots' recordings as one source of common named numbers and cameras, padded, with masks.
+"""Merges several robots' recordings into one source of common named numbers and cameras, padded, with masks.
 
-A take of T rows, `mapping.rows.fps` a second, has
-  action                  float32 [D], the named numbers of `mapping.action`; 0 where the robot has none. Its readings
-                          end with the last row in which anything was done: T - 1 of T rows where the original kept
-                          a terminal observation, none in a take without actions.
-  action_mask             bool [T, D], True where this robot did that number in this row.
-  observation.state       float32 [T, S], of `mapping.state`; 0 where it has none.
-  observation.state_mask  bool [T, S], True where it has that number here and now.
-  every merged camera     uint8 [H, W, 3], fitted with its aspect kept, black around and where there is none;
-                          depth float32 [H, W] metres, nearest pixels, inf around and where there is none.
-  observation.cameras_mask  bool [T, cameras], True where a camera (in the order of `names`) shows something.
-  embodiment              int64 [T, 1], the robot's place in `facts["embodiments"]`.
-  what is kept whole      with `NAME_mask`, bool [T, 1]: whether there was any in this row. Points keep their own
-                          clock (what was newest at the first row is dated there); vectors are zero where not
-                          there. What followed: next.reward float32 [1], the sum of all rewards from this row until the next
-                          (so that a return is kept at any fps); bools: whether any was true; others: the newest.
-                          Like actions, they end with their last valid row.
-The instruction and the facts of a take are kept; start_ns moves to the first row. Numbers are resampled by the policies
-of `mapping.rows` (`resample`), by which a value is absent in gaps; an action lasts, at the end, for one row of its own
-clock. Numbers that are not finite, also as float32, are absent. A take of fewer than two rows is skipped.
+A take of T rows, `mapping.rows.fps` per second, has
+  action                  float32 [D], the named numbers of `mapping.action`; 0 where the robot has none. Its readings end
+                          with the last row that has an action: T - 1 of T rows where the original has a terminal
+                          observation, none in a take without actions.
+  action_mask             bool [T, D], True where this robot has that number in this row.
+  observation.state       float32 [T, S], of `mapping.state`; 0 where the robot has none.
+  observation.state_mask  bool [T, S], True where the robot has that number in this row.
+  every merged camera     uint8 [H, W, 3], scaled with its aspect ratio kept, on black; depth float32 [H, W] in metres, nearest
+                          pixels, on inf. All black or inf where there is no picture.
+  observation.cameras_mask  bool [T, cameras], True where a camera (in the order of `names`) has a picture.
+  embodiment              int64 [T, 1], the index of the robot in `facts["embodiments"]`.
+  sensors kept whole      with `NAME_mask`, bool [T, 1], True where there is a value. Points keep their own clock (the newest
+                          scan at the first row is dated to it); missing vectors are zero. next.reward is float32 [1], the
+                          sum of all rewards from this row until the next (so that returns are kept at any fps); bools are
+                          True if any was; others are the newest value. Like actions, they end with their last valid row.
+The instruction and the facts of a take are kept; start_ns moves to the first row. Numbers are resampled by the policies of
+`mapping.rows` (see `resample`), which leave gaps empty; the last action lasts for one period of its own clock. Numbers that
+are not finite, also as float32, are masked. A take with fewer than two rows is skipped.
 """
 
 from __future__ import annotations
@@ -55,10 +54,11 @@ def merge(
     name: str = "merged",
     terminal: bool = True,
 ) -> Source:
-    """One source of all takes of the mapping's sources (path -> Source), in the mapping's order, made as they are read.
+    """One source of all takes of the mapping's sources (path -> Source), in the mapping's order, merged as they are read.
 
-    terminal: False to give the last rows an action (zeros, masked) too, for formats in which all takes end alike.
-    report:   filled while the takes are read. DatasetError where the mapping does not suit the sources.
+    report:   filled while the takes are read.
+    terminal: False gives the last rows an action (zeros, masked) too, for formats in which all takes end alike.
+    DatasetError where the mapping does not fit the sources.
     """
     check_mapping(mapping, sources)
     report = report if report is not None else MergeReport()
@@ -81,10 +81,10 @@ def merge(
                 except DatasetError as error:
                     raise DatasetError(f"take {number} of {source.path}: {error}") from error
                 if merged is None:
-                    count.skipped.append(f"take {number}: what is mapped of it makes fewer than two rows")
+                    count.skipped.append(f"take {number}: its mapped sensors give fewer than two rows")
                 else:
-                    whence = {"embodiment": source.embodiment, "source": source.path, "take": number}
-                    yield replace(merged, facts={**take.facts, **merged.facts, **whence})
+                    origin = {"embodiment": source.embodiment, "source": source.path, "take": number}
+                    yield replace(merged, facts={**take.facts, **merged.facts, **origin})
         report.complete = True
 
     robots = set(mapping.embodiments)
@@ -104,10 +104,9 @@ def merge(
 
 
 def letterbox(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Fits an image (uint8 [H, W, 3]) or depth (float32 [H, W]) into height x width, aspect kept, in the middle.
+    """Fits an image (uint8 [H, W, 3]) or depth (float32 [H, W]) into height x width, centred, with its aspect ratio kept.
 
-    Images are made smaller by the mean of the area (Pillow's box filter), larger by bilinear interpolation, on black; of
-    depth the nearest pixels are taken, on inf.
+    Images are downscaled by Pillow's box filter and upscaled bilinearly, on black; depth takes the nearest pixels, on inf.
     """
     if picture.shape[:2] == (height, width):
         return picture
@@ -127,7 +126,7 @@ def letterbox(picture: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def fit(height: int, width: int, to_height: int, to_width: int) -> tuple[int, int, int, int]:
-    """(height, width, top, left) of a picture of height x width within to_height x to_width, aspect kept, in pixels."""
+    """(height, width, top, left) in pixels of a height x width picture letterboxed into to_height x to_width."""
     scale = min(to_height / height, to_width / width)
     down = min(max(round(height * scale), 1), to_height)
     across = min(max(round(width * scale), 1), to_width)
@@ -136,10 +135,10 @@ def fit(height: int, width: int, to_height: int, to_width: int) -> tuple[int, in
 
 def _sensors(mapping: MergeMapping, sources: Mapping[str, Source]) -> dict[str, Sensor]:
     rate = mapping.rows.fps
-    found: dict[str, Sensor] = {}
+    sensors: dict[str, Sensor] = {}
 
     def vector(name: str, dtype: str, names: tuple[str, ...], **more) -> None:
-        found[name] = Sensor(name, "vector", (len(names),), dtype, names, rate_hz=rate, **more)
+        sensors[name] = Sensor(name, "vector", (len(names),), dtype, names, rate_hz=rate, **more)
 
     for key, dimensions in ((ACTION, mapping.action), (STATE, mapping.state)):
         if dimensions:
@@ -151,19 +150,19 @@ def _sensors(mapping: MergeMapping, sources: Mapping[str, Source]) -> dict[str, 
             vector(mask_of(key), "bool", names)
     for name, camera in mapping.cameras.items():
         shape = (camera.height, camera.width, 3) if camera.kind == "image" else (camera.height, camera.width)
-        found[name] = Sensor(name, camera.kind, shape, "uint8" if camera.kind == "image" else "float32", rate_hz=rate)
+        sensors[name] = Sensor(name, camera.kind, shape, "uint8" if camera.kind == "image" else "float32", rate_hz=rate)
     if mapping.cameras:
         vector(CAMERAS_MASK, "bool", tuple(mapping.cameras))
     vector(EMBODIMENT, "int64", (EMBODIMENT,), facts={"embodiments": list(mapping.embodiments)})
     for source in mapping.sources:
         for name, to in source.keep.items():
             sensor = sources[source.path].sensors[name]
-            dtype = sensor.dtype if to not in found else np.result_type(found[to].dtype, sensor.dtype).name
+            dtype = sensor.dtype if to not in sensors else np.result_type(sensors[to].dtype, sensor.dtype).name
             dtype = "float32" if to == f"{FOLLOWS}reward" else dtype
             own = sensor.rate_hz if sensor.kind == "points" else rate
-            found[to] = replace(found.get(to, sensor), name=to, dtype=dtype, rate_hz=own)
+            sensors[to] = replace(sensors.get(to, sensor), name=to, dtype=dtype, rate_hz=own)
             vector(mask_of(to), "bool", (to,))
-    return found
+    return sensors
 
 
 def _take(
@@ -204,8 +203,8 @@ def _take(
     readings = {name: Readings(time_s[: len(it)], it) for name, it in merged.items()}
     readings |= _scans(take, at_s, source, mapping, sensors)
     start_ns = None if take.start_ns is None else take.start_ns + round(at_s[0] * 1e9)
-    said: Any = take.facts.get("language", ())
-    facts = {"language": [[when - at_s[0], words] for when, words in said]} if said else {}
+    language: Any = take.facts.get("language", ())
+    facts = {"language": [[when - at_s[0], words] for when, words in language]} if language else {}
     return Take({name: readings[name] for name in sensors}, take.task, start_ns, facts)
 
 
@@ -219,7 +218,7 @@ def _tally(count: SensorCount, readings: Readings, rows: int) -> None:
 
 
 def _numbers(key, take, at_s, source, origin, mapping, count) -> tuple[np.ndarray, np.ndarray]:
-    """(float32 [T, D], bool [T, D]): the merged action or state of one take, and where there is any."""
+    """(float32 [T, D], bool [T, D]): the merged action or state of one take, and its mask."""
     dimensions = mapping.action if key == ACTION else mapping.state
     places = {name: place for place, name in enumerate(dimensions)}
     values = np.zeros((len(at_s), len(places)), np.float32)
@@ -234,28 +233,30 @@ def _numbers(key, take, at_s, source, origin, mapping, count) -> tuple[np.ndarra
             labels = tuple(number.name for number in vector.numbers)
             sensor = replace(sensor, names=labels if all(labels) else ())
         units = {label: number.unit for label, number in zip(sensor.names, vector.numbers)}
-        found, valid = resample(take.readings[name], replace(sensor, units=units), at_s, policy, mapping.rows.max_gap_s)
+        sampled, valid = resample(
+            take.readings[name], replace(sensor, units=units), at_s, policy, mapping.rows.max_gap_s
+        )
         if name == ACTION:
-            valid &= _lasts(take.readings[name], at_s, sensor, source, mapping)
+            valid &= _is_ongoing(take.readings[name], at_s, sensor, source, mapping)
         sensor_count = count.sensors[name]
         sensor_count.rows_without += int((~valid).sum())
         for i in wanted:
             number = vector.numbers[i]
             scale, offset = affine(number, dimensions[number.to])
-            column = np.asarray(found)[:, i]
+            column = np.asarray(sampled)[:, i]
             with np.errstate(over="ignore", invalid="ignore"):
                 if (scale, offset) != (1.0, 0.0):
                     column = column * scale + offset
                 column = column.astype(np.float32)
             finite = np.isfinite(column)
             sensor_count.not_finite += int((valid & ~finite).sum())
-            there = valid & finite
-            values[there, places[number.to]], mask[there, places[number.to]] = column[there], True
+            kept = valid & finite
+            values[kept, places[number.to]], mask[kept, places[number.to]] = column[kept], True
     return values, mask
 
 
-def _lasts(readings: Readings, at_s: np.ndarray, sensor: Sensor, source: SourceMapping, mapping: MergeMapping):
-    """bool [T]: not later than one row of its own clock after the last reading: no action is known to go on after it."""
+def _is_ongoing(readings: Readings, at_s: np.ndarray, sensor: Sensor, source: SourceMapping, mapping: MergeMapping):
+    """bool [T]: at most one period of the sensor's clock after its last reading; later rows have no action."""
     time_s = clock_of(readings, sensor.name)
     rate = sensor.rate_hz or source.fps or mapping.rows.fps
     period = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1 / rate
@@ -268,7 +269,7 @@ def _until_last(values: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _pictures(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.ndarray | Lazy]:
-    found: dict[str, np.ndarray | Lazy] = {}
+    pictures: dict[str, np.ndarray | Lazy] = {}
     mask = np.zeros((len(at_s), len(mapping.cameras)), bool)
     filled = {to: name for name, to in source.cameras.items()}
     for place, to in enumerate(mapping.cameras):
@@ -278,42 +279,44 @@ def _pictures(take, at_s, source, origin, mapping, sensors, count) -> dict[str, 
             sensor, policy = origin.sensors[name], mapping.rows.images
             seen, mask[:, place] = resample(take.readings[name], sensor, at_s, policy, mapping.rows.max_gap_s)
             count.sensors[name].rows_without += int((~mask[:, place]).sum())
-        found[to] = _fitted(seen, mask[:, place], sensors[to], name)
-    return {**found, CAMERAS_MASK: mask}
+        pictures[to] = _letterboxed(seen, mask[:, place], sensors[to], name)
+    return {**pictures, CAMERAS_MASK: mask}
 
 
-def _fitted(seen, valid: np.ndarray, sensor: Sensor, name: str) -> Lazy:
+def _letterboxed(seen, valid: np.ndarray, sensor: Sensor, name: str) -> Lazy:
     def look(row: int) -> np.ndarray:
         if not valid[row]:
             return blank_value(sensor)
         picture, shape = np.asarray(seen[row]), sensor.shape
-        good = picture.ndim == len(shape) and picture.shape[2:] == shape[2:] and picture.size
-        if not good or picture.dtype != sensor.dtype:
-            raise DatasetError(f"row {row} of {name} is {picture.dtype} {picture.shape}, which is no {sensor.kind}.")
+        fits = picture.ndim == len(shape) and picture.shape[2:] == shape[2:] and picture.size
+        if not fits or picture.dtype != sensor.dtype:
+            raise DatasetError(
+                f"row {row} of {name} is {picture.dtype} {picture.shape}, not {sensor.kind}; restore it."
+            )
         return letterbox(picture, shape[0], shape[1])
 
     return Lazy(len(valid), look)
 
 
 def _scans(take, at_s, source, mapping, sensors) -> dict[str, Readings]:
-    """Points with a clock of their own, from the newest at the first row on."""
-    found: dict[str, Readings] = {}
+    """Points with their own clock, from the newest scan at the first row on."""
+    scans: dict[str, Readings] = {}
     filled = {to: name for name, to in source.keep.items()}
     for to in {to: None for it in mapping.sources for to in it.keep.values() if sensors[to].kind == "points"}:
         name = filled.get(to, "")
-        found[to] = Readings(np.zeros(0), [])
+        scans[to] = Readings(np.zeros(0), [])
         if name and _has(take, name):
             readings = take.readings[name]
             time_s = clock_of(readings, name)
             first = max(int(np.searchsorted(time_s, at_s[0] + SAME_TIME_S, side="right")) - 1, 0)
-            scans = Lazy(len(time_s) - first, lambda i, values=readings.values, first=first: values[first + i])
-            found[to] = Readings(np.maximum(time_s[first:] - at_s[0], 0), scans)
-    return found
+            values = Lazy(len(time_s) - first, lambda i, values=readings.values, first=first: values[first + i])
+            scans[to] = Readings(np.maximum(time_s[first:] - at_s[0], 0), values)
+    return scans
 
 
 def _kept(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.ndarray]:
-    """What is kept whole, but points, and the masks of all, for every kept sensor of any source."""
-    found: dict[str, np.ndarray] = {}
+    """The sensors kept whole of any source: values (except of points) and masks."""
+    kept: dict[str, np.ndarray] = {}
     filled = {to: name for name, to in source.keep.items()}
     for to in {to: None for it in mapping.sources for to in it.keep.values()}:
         name, sensor = filled.get(to, ""), sensors[to]
@@ -321,7 +324,7 @@ def _kept(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.n
             valid = np.zeros(len(at_s), bool)
             values = np.zeros((len(at_s), *sensor.shape), sensor.dtype)
         elif to.startswith(FOLLOWS):
-            values, valid = _followed(take.readings[name], origin.sensors[name], sensor, at_s, source, mapping)
+            values, valid = _outcomes(take.readings[name], origin.sensors[name], sensor, at_s, source, mapping)
         elif sensor.kind == "points":
             index = picked_rows(clock_of(take.readings[name], name), at_s, mapping.rows.images, mapping.rows.max_gap_s)
             values, valid = np.zeros(0), index >= 0
@@ -337,54 +340,53 @@ def _kept(take, at_s, source, origin, mapping, sensors, count) -> dict[str, np.n
             count.sensors[name].rows_without += int((~valid).sum())
         follows = to.startswith(FOLLOWS)
         if sensor.kind != "points":
-            found[to] = _until_last(np.asarray(values), valid[:, None]) if follows else np.asarray(values)
-        found[mask_of(to)] = valid[:, None]
-    return found
+            kept[to] = _until_last(np.asarray(values), valid[:, None]) if follows else np.asarray(values)
+        kept[mask_of(to)] = valid[:, None]
+    return kept
 
 
-def _followed(readings, sensor: Sensor, merged: Sensor, at_s, source, mapping) -> tuple[np.ndarray, np.ndarray]:
-    """What followed each row until the next: rewards are added up, bools are true where any was, others the newest."""
+def _outcomes(readings, sensor: Sensor, merged: Sensor, at_s, source, mapping) -> tuple[np.ndarray, np.ndarray]:
+    """Outcomes from each row until the next: rewards are summed, bools are True if any was, others are the newest."""
     time_s, values = clock_of(readings, sensor.name), stacked(readings, sensor)
     row = np.searchsorted(at_s, time_s + SAME_TIME_S, side="right") - 1
     values, row = values[row >= 0], row[row >= 0]
-    covered = (at_s >= time_s[0] - SAME_TIME_S) & _lasts(readings, at_s, sensor, source, mapping)
+    covered = (at_s >= time_s[0] - SAME_TIME_S) & _is_ongoing(readings, at_s, sensor, source, mapping)
     valid = covered | np.isin(np.arange(len(at_s)), row)
     if merged.name == f"{FOLLOWS}reward":
-        found = np.zeros((len(at_s), 1))
-        np.add.at(found, row, values.astype(np.float64))
+        result = np.zeros((len(at_s), 1))
+        np.add.at(result, row, values.astype(np.float64))
     elif merged.dtype == "bool":
-        found = np.zeros((len(at_s), 1), bool)
-        np.logical_or.at(found, row, values)
+        result = np.zeros((len(at_s), 1), bool)
+        np.logical_or.at(result, row, values)
     else:
-        found, _ = resample(readings, sensor, at_s, "previous")
-        found = np.array(found)
-        found[row] = values  # the newest in each row, for readings ascend
-    valid &= np.isfinite(found[:, 0])
-    return np.where(valid[:, None], found, 0).astype(merged.dtype), valid
+        result = np.array(resample(readings, sensor, at_s, "previous")[0])
+        result[row] = values  # the newest in each row, because readings ascend in time
+    valid &= np.isfinite(result[:, 0])
+    return np.where(valid[:, None], result, 0).astype(merged.dtype), valid
 
 
 def _views(mapping: MergeMapping, sources: Mapping[str, Source], robot: str) -> dict[str, dict]:
-    """merged camera -> which of the robot's sensors it shows, its size and calibration, and where its picture lies."""
-    found: dict[str, dict] = {}
+    """Merged camera -> the robot's sensor, its size and calibration, and where its picture is placed."""
+    views: dict[str, dict] = {}
     for source in mapping.sources:
         for name, to in source.cameras.items() if source.embodiment == robot else ():
             sensor, camera = sources[source.path].sensors[name], mapping.cameras[to]
             down, across, top, left = fit(sensor.shape[0], sensor.shape[1], camera.height, camera.width)
             placed = {"height": down, "width": across, "top": top, "left": left}
-            found.setdefault(to, {"sensor": name, "size": list(sensor.shape[:2]), "placed": placed})
+            views.setdefault(to, {"sensor": name, "size": list(sensor.shape[:2]), "placed": placed})
             if "calibration" in sensor.facts:
-                found[to].setdefault("calibration", sensor.facts["calibration"])
-    return found
+                views[to].setdefault("calibration", sensor.facts["calibration"])
+    return views
 
 
 def _left_out(source: SourceMapping, origin: Source) -> dict[str, str]:
-    found = dict(source.out)
+    reasons = dict(source.out)
     for name, vector in source.vectors.items():
         for place, number in enumerate(vector.numbers):
             if number.out:
-                found[f"{name}[{place}]" + (f" {number.name}" if number.name else "")] = number.out
+                reasons[f"{name}[{place}]" + (f" {number.name}" if number.name else "")] = number.out
     mentioned = {*source.vectors, *source.cameras, *source.keep, *source.out}
-    return found | {name: "the mapping does not mention it" for name in origin.sensors if name not in mentioned}
+    return reasons | {name: "the mapping does not mention it" for name in origin.sensors if name not in mentioned}
 
 
 def _count(source: SourceMapping, origin: Source, mapping: MergeMapping) -> SourceCount:

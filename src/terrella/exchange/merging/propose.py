@@ -1,4 +1,4 @@
-"""propose: the mapping of several robots into one set, as far as names, units and frames allow; a person does the rest."""
+"""Proposes the mapping of a merge, as far as names, units and frames allow; a person completes it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..formats.rows import unique
 from .mapping import (
     ACTION,
     FOLLOWS,
-    MADE,
+    MERGED,
     NAME,
     STATE,
     Dimension,
@@ -29,7 +29,7 @@ from .mapping import (
 )
 from .units import basic, quantity
 
-_WIDE = 64  # an unnamed vector of more numbers (an embedding, a tactile skin) is kept whole, not taken apart
+_MAX_SPLIT = 64  # an unnamed vector with more numbers (an embedding, a tactile skin) is kept whole
 _ENDINGS = {
     "m": "m",
     "cm": "cm",
@@ -44,12 +44,12 @@ _POSITION = re.compile(r"(?:p|pos|position|translation)_?([xyz])")
 _ROTATION = re.compile(r"(?:q|quat|quaternion|orientation|rotation)_?([wxyz])")
 
 
-_Notes = dict[str, dict[str, list[str]]]  # source -> what a person should look at -> the numbers or sensors concerned
+_Notes = dict[str, dict[str, list[str]]]  # source -> note for a person -> the numbers or sensors concerned
 
 
 @dataclass(frozen=True)
 class _Place:
-    """One number of one sensor of one source. `stem` is what it may share with others, None where it has no name."""
+    """One number of one sensor of one source. `stem` is the name that others may share; None if it has no name."""
 
     source: str
     embodiment: str
@@ -62,30 +62,30 @@ class _Place:
 
     @property
     def own(self) -> str:
-        """The dimension that it has for itself alone."""
+        """The name of a dimension of this number alone."""
         return f"{self.embodiment}.{self.stem or f'{_short(self.sensor)}_{self.index}'}"
 
 
 def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMapping:
-    """A first mapping of the sources (path -> Source), to be written, looked at and edited.
+    """A first mapping of the sources (path -> Source), to be checked and edited by a person.
 
-    Numbers of the same name fill one dimension: names compared without case and punctuation, a unit at the end (x_mm) taken
-    for its unit, position_x and quat_w for x and qw, those of sensors other than "action" and "observation.state" with
-    the sensor's name before them ("imu.ax"). Units are converted where both are stated, to the one unit or their quantity's basic
-    one. Different stated frames or quantities are different dimensions. What has no name gets a dimension of its own, as
-    "aloha.state_3", which sources of one embodiment share. Cameras of the same name are one, at the smallest of their sizes.
-    Each guess worth a look is in its source's `notes`.
+    Numbers of the same name fill one dimension. Names are compared without case and punctuation; a unit at the end (x_mm) is
+    read as the unit; position_x and quat_w are x and qw; names in sensors other than "action" and "observation.state" get the
+    sensor's name as prefix ("imu.ax"). Units are converted if both are stated, to the common unit or the quantity's basic one.
+    Different stated frames or quantities give different dimensions. A number without a name gets its own dimension, such as
+    "aloha.state_3", shared by sources of one embodiment. Cameras of the same name become one, at their smallest size. Every
+    guess that should be checked is in its source's `notes`.
 
-    fps: of the merged rows; None: the slowest of the sources'.
+    fps: of the merged rows; None for the slowest source's.
     DatasetError without a source, or where no fps is known.
     """
     if not sources:
-        raise DatasetError("there is nothing to merge; name at least one recording.")
+        raise DatasetError("no recordings are given; name at least one.")
     names = _embodiments(sources)
     rates = {path: _rate(source) for path, source in sources.items()}
     known = [rate for rate in rates.values() if rate]
     if fps is None and not known:
-        raise DatasetError("none of the recordings says how many rows a second it has; give the fps of the merged one.")
+        raise DatasetError("none of the recordings states its fps; give the fps of the merged one.")
     notes: _Notes = {path: {} for path in sources}
     places = [place for path in sources for place in _places(path, sources[path], names[path])]
     filled: dict[_Place, str] = {}
@@ -100,15 +100,15 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
             if place.source == path:
                 number = Number(place.name, filled[place], place.unit)
                 vectors.setdefault(place.sensor, []).append(number)
-        seen = {name: name for name, it in source.sensors.items() if name in cameras and it.kind == cameras[name].kind}
-        keep, out = _rest(source, names[path] if several else "", cameras, {*vectors, *seen})
+        views = {name: name for name, it in source.sensors.items() if name in cameras and it.kind == cameras[name].kind}
+        keep, out = _rest(source, names[path] if several else "", cameras, {*vectors, *views})
         mapped.append(
             SourceMapping(
                 path=path,
                 embodiment=names[path],
                 fps=rates[path],
                 vectors={name: Vector(tuple(n), source.sensors[name].frame) for name, n in vectors.items()},
-                cameras=seen,
+                cameras=views,
                 keep=keep,
                 out=out,
                 notes=tuple(f"{', '.join(subjects)}: {what}" for what, subjects in notes[path].items()),
@@ -120,8 +120,8 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
 
 
 def _embodiments(sources: Mapping[str, Source]) -> dict[str, str]:
-    """path -> name: one name for one robot with one set of vectors, numbered where two robots have one name."""
-    found: dict[str, str] = {}
+    """path -> robot name; robots with one name but different vectors are numbered."""
+    names: dict[str, str] = {}
     forms: dict[str, object] = {}
     for path, source in sources.items():
         base = source.robot or source.name or "robot"
@@ -133,21 +133,21 @@ def _embodiments(sources: Mapping[str, Source]) -> dict[str, str]:
         number = 1
         while forms.setdefault(name := base if number == 1 else f"{base}_{number}", form) != form:
             number += 1
-        found[path] = name
-    return found
+        names[path] = name
+    return names
 
 
 def _rate(source: Source) -> float | None:
-    """Its rows a second: as it says, else its slowest camera's or else action's rate, said or seen in its first take."""
+    """Rows per second: the source's fps, else the rate of its slowest camera or else of its action, stated or measured."""
     if source.fps:
         return float(source.fps)
     pictures = [name for name, sensor in source.sensors.items() if sensor.kind == "image"]
-    names = pictures or [name for name in source.sensors if name == ACTION] or list(source.sensors)
-    said = [rate for name in names if (rate := source.sensors[name].rate_hz)]
-    if said:
-        return float(min(said))
+    chosen = pictures or [name for name in source.sensors if name == ACTION] or list(source.sensors)
+    stated = [rate for name in chosen if (rate := source.sensors[name].rate_hz)]
+    if stated:
+        return float(min(stated))
     take = next(iter(source.takes()), None)
-    clocks = [np.asarray(take.readings[name].time_s) for name in names if name in take.readings] if take else []
+    clocks = [np.asarray(take.readings[name].time_s) for name in chosen if name in take.readings] if take else []
     steps = [float(np.median(np.diff(clock))) for clock in clocks if len(clock) > 1]
     return round(1 / max(steps), 3) if steps and 0 < max(steps) < np.inf else None
 
@@ -161,37 +161,42 @@ def _short(sensor: str) -> str:
 
 
 def _places(path: str, source: Source, embodiment: str) -> list[_Place]:
-    found: list[_Place] = []
+    places: list[_Place] = []
     for name, sensor in source.sensors.items():
-        if sensor.kind != "vector" or len(sensor.shape) != 1 or sensor.dtype == "string" or not _belongs(name, source):
+        if (
+            sensor.kind != "vector"
+            or len(sensor.shape) != 1
+            or sensor.dtype == "string"
+            or not _is_mapped(name, source)
+        ):
             continue
-        if name not in (ACTION, STATE) and not sensor.names and sensor.shape[0] > _WIDE:
+        if name not in (ACTION, STATE) and not sensor.names and sensor.shape[0] > _MAX_SPLIT:
             continue
         for index in range(sensor.shape[0]):
             label = sensor.names[index] if sensor.names else ""
             stem, unit = _stem(name, sensor, label)
-            found.append(_Place(path, embodiment, name, index, stem, label, unit, sensor.frame))
+            places.append(_Place(path, embodiment, name, index, stem, label, unit, sensor.frame))
     shared: set[tuple[bool, str]] = set()
-    for at, place in enumerate(found):  # what one source has twice is not shared twice
+    for at, place in enumerate(places):  # a name that occurs twice in one source is shared once
         for stem in (place.stem, f"{_short(place.sensor)}.{place.name}", None):
             if stem is None or (place.sensor == ACTION, stem) not in shared:
                 break
-        found[at] = replace(place, stem=stem if place.stem else None)
+        places[at] = replace(place, stem=stem if place.stem else None)
         shared.add((place.sensor == ACTION, stem or ""))
-    return found
+    return places
 
 
-def _belongs(name: str, source: Source) -> bool:
+def _is_mapped(name: str, source: Source) -> bool:
     return name == ACTION or (name.startswith("observation.") and not _is_mask(name, source))
 
 
 def _is_mask(name: str, source: Source) -> bool:
     whole = name.removesuffix("_mask")
-    return name not in (ACTION, STATE) and (name in MADE or (whole != name and whole in source.sensors))
+    return name not in (ACTION, STATE) and (name in MERGED or (whole != name and whole in source.sensors))
 
 
 def _stem(sensor_name: str, sensor: Sensor, label: str) -> tuple[str | None, str]:
-    """(what the number is called, None where it has no name of its own; its unit)."""
+    """(the number's name, None if it has none of its own; its unit)."""
     unit = sensor.units.get(label, "")
     short = _short(sensor_name).lower()
     stem = re.sub(r"[\W_]+", "_", label.lower()).strip("_")
@@ -210,18 +215,18 @@ def _stem(sensor_name: str, sensor: Sensor, label: str) -> tuple[str | None, str
 
 
 def _share(places: list[_Place], filled: dict[_Place, str], notes: _Notes) -> dict[str, Dimension]:
-    """The dimensions that these numbers need, in the order in which they are met; which one each fills goes to `filled`."""
+    """The dimensions of these numbers, in order of appearance; `filled` gets the dimension of each number."""
     groups: dict[str, list[_Place]] = {}
     for place in places:
         groups.setdefault(place.own if place.stem is None else place.stem, []).append(place)
-    found: dict[str, Dimension] = {}
+    dimensions: dict[str, Dimension] = {}
     for members in groups.values():
         if members[0].stem is None:
             dimension = Dimension(_common_unit(members), members[0].frame)
-            _fill(members, members[0].own, dimension, found, filled)
+            _fill(members, members[0].own, dimension, dimensions, filled)
             for place in members:
-                said = f"without a name in {place.sensor}, so of this robot alone."
-                notes[place.source].setdefault(said, []).append(filled[place])
+                note = f"no name in {place.sensor}, so used for this robot only."
+                notes[place.source].setdefault(note, []).append(filled[place])
             continue
         frames = {place.frame for place in members} - {""}
         kinds = {quantity(place.unit) or place.unit for place in members} - {""}
@@ -231,41 +236,41 @@ def _share(places: list[_Place], filled: dict[_Place, str], notes: _Notes) -> di
             name = _title(members)
             if not known:
                 name = place.own
-                said = f"no frame or unit is stated in {place.sensor}, and others of that name differ in it: of this robot alone."
-                notes[place.source].setdefault(said, []).append(name)
+                note = f"no frame or unit in {place.sensor}, but others of that name differ in it: used for this robot only."
+                notes[place.source].setdefault(note, []).append(name)
             else:
                 name += f" ({basic(place.unit)})" if len(kinds) > 1 else ""
                 name += f" @ {place.frame}" if len(frames) > 1 else ""
             parted.setdefault(name, []).append(place)
         if len(parted) > 1:
             for place in members:
-                said = f"of {place.sensor}, differs in frame or quantity from others of that name: see {', '.join(parted)}."
-                notes[place.source].setdefault(said, []).append(place.name)
+                note = f"in {place.sensor}, differs in frame or quantity from others of that name: see {', '.join(parted)}."
+                notes[place.source].setdefault(note, []).append(place.name)
         for name, part in parted.items():
             dimension = Dimension(_common_unit(part), next((place.frame for place in part if place.frame), ""))
-            _fill(part, name, dimension, found, filled)
-            _unstated(part, dimension, filled, notes)
-    return found
+            _fill(part, name, dimension, dimensions, filled)
+            _note_unstated(part, dimension, filled, notes)
+    return dimensions
 
 
-def _fill(part: list[_Place], name: str, dimension: Dimension, found: dict, filled: dict[_Place, str]) -> None:
-    free = unique(name, found)
-    found[free] = dimension
+def _fill(part: list[_Place], name: str, dimension: Dimension, dimensions: dict, filled: dict[_Place, str]) -> None:
+    free = unique(name, dimensions)
+    dimensions[free] = dimension
     filled.update(dict.fromkeys(part, free))
 
 
-def _unstated(part: list[_Place], dimension: Dimension, filled: Mapping[_Place, str], notes: _Notes) -> None:
+def _note_unstated(part: list[_Place], dimension: Dimension, filled: Mapping[_Place, str], notes: _Notes) -> None:
     if len({place.source for place in part}) < 2:
         return
     for place in part:
         for what, here, shared in (("unit", place.unit, dimension.unit), ("frame", place.frame, dimension.frame)):
             if shared and not here:
-                said = f"no {what} is stated in {place.sensor}; '{shared}' is taken, as another recording has it."
-                notes[place.source].setdefault(said, []).append(filled[place])
+                note = f"no {what} is stated in {place.sensor}; '{shared}' is assumed, as in another recording."
+                notes[place.source].setdefault(note, []).append(filled[place])
 
 
 def _title(members: list[_Place]) -> str:
-    """The name as all have it, else without case, punctuation and unit."""
+    """The name if all spell it alike, else without case, punctuation and unit."""
     stem, prefix = members[0].stem or "", f"{_short(members[0].sensor)}."
     labels = {place.name for place in members}
     if len(labels) > 1:
@@ -279,38 +284,38 @@ def _common_unit(part: list[_Place]) -> str:
 
 
 def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, MergedCamera]:
-    """Every image and depth sensor by its name, at the size of its smallest; an image wins where kinds differ."""
-    found: dict[str, MergedCamera] = {}
+    """Every image and depth sensor by name, at its smallest size; images take precedence over depth."""
+    cameras: dict[str, MergedCamera] = {}
     for path, source in sources.items():
         for name, sensor in source.sensors.items():
-            if sensor.kind not in ("image", "depth") or not name.startswith("observation.") or name in MADE:
+            if sensor.kind not in ("image", "depth") or not name.startswith("observation.") or name in MERGED:
                 continue
             if not NAME.fullmatch(name):
                 continue
-            camera, before = MergedCamera(sensor.kind, *map(int, sensor.shape[:2])), found.get(name)
+            camera, before = MergedCamera(sensor.kind, *map(int, sensor.shape[:2])), cameras.get(name)
             if before and before.kind != camera.kind:
-                said = f"of kind {camera.kind} here and {before.kind} elsewhere."
-                notes[path].setdefault(said, []).append(name)
+                note = f"of kind {camera.kind} here and {before.kind} elsewhere."
+                notes[path].setdefault(note, []).append(name)
                 camera = min(before, camera, key=lambda it: it.kind != "image")
             elif before:
                 camera = min(before, camera, key=lambda it: (it.height * it.width, it.height))
-            found[name] = camera
+            cameras[name] = camera
     for path, source in sources.items():
-        for name, camera in found.items():
+        for name, camera in cameras.items():
             sensor = source.sensors.get(name)
             if sensor and sensor.kind == camera.kind and tuple(sensor.shape[:2]) != (camera.height, camera.width):
-                said = f"fitted from {sensor.shape[0]} x {sensor.shape[1]} into {camera.height} x {camera.width}."
-                notes[path].setdefault(said, []).append(name)
-    return found
+                note = f"scaled from {sensor.shape[0]} x {sensor.shape[1]} to {camera.height} x {camera.width}."
+                notes[path].setdefault(note, []).append(name)
+    return cameras
 
 
 def _rest(
     source: Source, embodiment: str, cameras: Mapping[str, MergedCamera], mapped: set[str]
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """(kept whole: sensor -> its name in the merged set; left out: sensor -> why), for whatever is not in `mapped`."""
+    """(kept whole: sensor -> its merged name; left out: sensor -> why), for every sensor that is not in `mapped`."""
     keep: dict[str, str] = {}
     out: dict[str, str] = {}
-    taken = {*MADE, *cameras}
+    taken = {*MERGED, *cameras}
     for name, sensor in source.sensors.items():
         if name in mapped:
             continue
@@ -322,15 +327,15 @@ def _rest(
         elif embodiment and not name.startswith(FOLLOWS):
             to = f"observation.{embodiment}.{_short(name)}"
         if sensor.kind in ("image", "depth"):
-            out[name] = "another recording has this name for another kind, or it is no name of what observes"
+            out[name] = "another recording uses this name for another kind, or it is not an observation"
         elif name.startswith(FOLLOWS) and (sensor.kind != "vector" or sensor.shape != (1,)):
-            out[name] = "what follows a row must be one number"
+            out[name] = "an outcome of a row must be one number"
         elif sensor.dtype == "string":
-            out[name] = "text is not merged (the instruction of a take is kept)"
+            out[name] = "text is not merged (only the instruction of a take)"
         elif _is_mask(name, source):
-            out[name] = "a mask or number made by an earlier merge: merge the recordings that it was made of instead"
+            out[name] = "made by an earlier merge: merge the original recordings instead"
         elif not name.startswith(("observation.", FOLLOWS)) or not NAME.fullmatch(to) or {to, mask_of(to)} & taken:
-            out[name] = "neither an action, nor what was observed, nor what followed"
+            out[name] = "neither an action, an observation nor an outcome"
         else:
             keep[name] = to
             taken |= {to, mask_of(to)}

@@ -1,4 +1,4 @@
-"""MergeReport: what a merge did with every source: rows and gaps, what was left out, each robot's statistics."""
+"""The report of a merge: rows and gaps of every source, what was left out, each robot's statistics."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 from ...data import stats
 
-_SAMPLE = 1 << 18  # quantiles are exact up to this many values of a number, then from every 2nd, 4th, …
+_SAMPLE = 1 << 18  # quantiles use all values up to this many, then every 2nd, 4th, …
 
 
 class Running:
-    """Statistics of named numbers, each over its own valid rows, gathered bit by bit."""
+    """Incremental statistics of named numbers, each over its own valid rows."""
 
     def __init__(self, names: Sequence[str]):
         self._names = tuple(names)
@@ -30,7 +30,7 @@ class Running:
                 self._summaries = stats.merge([self._summaries, {name: stats.summarise(new)}])
 
     def _sample(self, name: str, values: np.ndarray) -> None:
-        """Keeps value j of all that this number ever had where j is a multiple of the stride."""
+        """Keeps every value of this number whose index, over all takes, is a multiple of the stride."""
         before = int(self._summaries[name]["count"][0]) if name in self._summaries else 0
         new = values[-before % self._strides[name] :: self._strides[name]].astype(np.float32)
         self._samples[name] = np.concatenate([self._samples[name], new])
@@ -38,35 +38,35 @@ class Running:
             self._samples[name], self._strides[name] = self._samples[name][::2], self._strides[name] * 2
 
     def to_json(self) -> dict[str, dict]:
-        """name -> min, max, mean, std, q01, q99, count, of all numbers that have a valid row."""
-        found: dict[str, dict] = {}
+        """name -> min, max, mean, std, q01, q99, count, for each number with a valid row."""
+        statistics: dict[str, dict] = {}
         for name, summary in self._summaries.items():
             low, high = np.quantile(self._samples[name].astype(np.float64), (0.01, 0.99))
             numbers = {key: float(value[0]) for key, value in summary.items() if key != "count"}
-            found[name] = {**numbers, "q01": float(low), "q99": float(high), "count": int(summary["count"][0])}
-        return found
+            statistics[name] = {**numbers, "q01": float(low), "q99": float(high), "count": int(summary["count"][0])}
+        return statistics
 
 
 @dataclass
 class SensorCount:
-    """What became of one sensor's readings."""
+    """How one sensor's readings were used."""
 
     readings: int = 0
     rows: int = 0
-    rows_without: int = 0  # before its first reading, in a gap, after its end
+    rows_without: int = 0  # before the first reading, in gaps, after the last
     longest_gap_s: float = 0.0
-    not_finite: int = 0  # numbers that were NaN or infinite, and so are masked
+    not_finite: int = 0  # numbers that were NaN or infinite, now masked
 
 
 @dataclass
 class SourceCount:
-    """What became of one source."""
+    """How one source was used."""
 
     path: str
     embodiment: str
     takes: int = 0
     rows: int = 0
-    late_s: float = 0.0  # time before the first rows, while a sensor had not begun
+    late_s: float = 0.0  # skipped at the start of takes, until every sensor had a reading
     skipped: list[str] = field(default_factory=list)
     sensors: dict[str, SensorCount] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
@@ -74,10 +74,10 @@ class SourceCount:
 
 
 class MergeReport:
-    """Filled while the takes of a merged source are read, begun anew when they are read anew.
+    """Filled while the takes of a merged source are read; each iteration starts it again.
 
-    complete: whether the last reading reached the end.
-    sources:  a SourceCount for each.
+    complete: whether the last iteration reached the end.
+    sources:  path -> SourceCount.
     """
 
     def __init__(self) -> None:
@@ -98,17 +98,16 @@ class MergeReport:
         self._statistics[robot, key].add(values, mask)
 
     def embodiments(self) -> list[dict]:
-        """For meta/terrella.json: each robot's number, name, sources, cameras, takes, rows, and the statistics of its
-        action and state: name -> min, max, mean, std, q01, q99, count over its own valid rows (what it never has is not
-        there).
+        """For meta/terrella.json: each robot's number, name, sources, cameras, takes, rows, and statistics of action and state:
+        name -> min, max, mean, std, q01, q99, count over its valid rows, for the numbers that it has.
         """
-        found = []
+        robots = []
         for number, (name, facts) in enumerate(self._robots.items()):
-            mine = [source for source in self.sources.values() if source.embodiment == name]
+            own = [source for source in self.sources.values() if source.embodiment == name]
             statistics = {key: it.to_json() for (robot, key), it in self._statistics.items() if robot == name}
-            counts = {"takes": sum(source.takes for source in mine), "rows": sum(source.rows for source in mine)}
-            found.append({"id": number, "name": name, **facts, **counts, "stats": statistics})
-        return found
+            counts = {"takes": sum(source.takes for source in own), "rows": sum(source.rows for source in own)}
+            robots.append({"id": number, "name": name, **facts, **counts, "stats": statistics})
+        return robots
 
     def to_json(self) -> dict:
         return {
@@ -118,19 +117,17 @@ class MergeReport:
         }
 
     def text(self) -> str:
-        """For a person: what was made of each source and what could not be mapped."""
-        lines = [] if self.complete else ["The merge is not complete: these are its sources up to where it stopped."]
+        """The report as text: what was read of each source and what was left out."""
+        lines = [] if self.complete else ["The merge is incomplete: these are its sources up to where it stopped."]
         for source in self.sources.values():
             lines.append(f"{source.embodiment}: {source.takes} takes, {source.rows} rows from {source.path}")
             if source.late_s > 0:
-                lines.append(
-                    f"  {source.late_s:.2f} s skipped at the beginning of takes, before every sensor had begun"
-                )
+                lines.append(f"  {source.late_s:.2f} s skipped at the start of takes, until every sensor had a reading")
             lines += [f"  skipped {why}" for why in source.skipped]
             for name, it in source.sensors.items():
                 line = f"  {name}: {it.rows} rows from {it.readings} readings, longest gap {it.longest_gap_s:.3g} s"
                 line += f"; {it.rows_without} rows without it" if it.rows_without else ""
-                line += f"; {it.not_finite} numbers not finite" if it.not_finite else ""
+                line += f"; {it.not_finite} numbers that are not finite" if it.not_finite else ""
                 lines.append(line)
             lines += [f"  left out {name}: {why}" for name, why in source.left_out.items()]
             lines += [f"  look at: {note}" for note in source.notes]

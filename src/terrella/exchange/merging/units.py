@@ -1,4 +1,4 @@
-"""units: what one unit is in another ("deg" -> "rad", "mm" -> "m", "0..255" -> "0..1"), for units of one quantity."""
+"""Conversion between units of one quantity: "deg" -> "rad", "mm" -> "m", "0..255" -> "0..1"."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PREFIXED = {
     "T": "field",
     "Pa": "pressure",
 }
-# unit -> (quantity, how many of that quantity's first unit it is, what is added then)
+# unit -> (quantity, factor to that quantity's basic unit, offset)
 _PLAIN: dict[str, tuple[str, float, float]] = {
     **{sign + unit: (what, by, 0) for unit, what in _PREFIXED.items() for sign, by in _PREFIXES.items()},
     "in": ("length", 0.0254, 0),
@@ -36,9 +36,9 @@ _PLAIN: dict[str, tuple[str, float, float]] = {
     "K": ("temperature", 1, 0),
     "degC": ("temperature", 1, 273.15),
     "rpm": ("angle/s", 2 * math.pi / 60, 0),
-    "g": ("length/s2", 9.80665, 0),  # as accelerometers count
+    "g": ("length/s2", 9.80665, 0),  # as accelerometers report
 }
-_ALSO = {
+_SYNONYMS = {
     "metre": "m", "meter": "m", "metres": "m", "meters": "m", "radian": "rad", "radians": "rad", "degree": "deg",
     "degrees": "deg", "°": "deg", "µm": "um", "µs": "us", "second": "s", "seconds": "s", "rev": "turn", "Nm": "N m",
     "N*m": "N m", "N·m": "N m", "°C": "degC", "percent": "%", "µT": "uT", "mps": "m/s", "radps": "rad/s",
@@ -48,14 +48,14 @@ _FIRST = {quantity: unit for unit, (quantity, factor, shift) in reversed(_PLAIN.
 
 
 def quantity(unit: str) -> str | None:
-    """What is measured in that unit ("length", "angle/s", …), None where the unit is "" or not known here."""
-    known = _known(unit)
+    """The quantity of a unit ("length", "angle/s", …); None for "" and unknown units."""
+    known = _lookup(unit)
     return known[0] if known else None
 
 
 def basic(unit: str) -> str:
-    """The basic unit of its quantity: "m" for "mm", "rad/s" for "rpm"; an unknown unit is its own."""
-    known = _known(unit)
+    """The basic unit of its quantity: "m" for "mm", "rad/s" for "rpm"; an unknown unit itself."""
+    known = _lookup(unit)
     if not known:
         return unit
     plain, slash, per = known[0].partition("/")
@@ -63,28 +63,28 @@ def basic(unit: str) -> str:
 
 
 def convert(unit: str, to: str) -> tuple[float, float]:
-    """(scale, offset): a number x in `unit` is scale * x + offset in `to`. (1, 0) where they are the same or one is "".
+    """(scale, offset): x in `unit` is scale * x + offset in `to`. (1, 0) where they are equal or one is "".
 
-    DatasetError where they measure different quantities, or differ and one of them is not known.
+    DatasetError where the quantities differ, or the units differ and one is unknown.
     """
     if unit == to or not unit or not to:
         return 1.0, 0.0
-    a, b = _known(unit), _known(to)
+    a, b = _lookup(unit), _lookup(to)
     if not a or not b:
         raise DatasetError(f"no conversion from '{unit or to}' to '{to}' is known; give its scale (and offset).")
     if a[0] != b[0]:
-        raise DatasetError(f"'{unit}' measures {a[0]} and '{to}' measures {b[0]}; give its scale where that is meant.")
+        raise DatasetError(f"'{unit}' measures {a[0]} and '{to}' measures {b[0]}; give its scale if that is intended.")
     if a[1:] == b[1:]:
         return 1.0, 0.0
     return a[1] / b[1], (a[2] - b[2]) / b[1]
 
 
-def _known(unit: str) -> tuple[str, float, float] | None:
-    unit = _ALSO.get(unit.strip(), unit.strip())
+def _lookup(unit: str) -> tuple[str, float, float] | None:
+    unit = _SYNONYMS.get(unit.strip(), unit.strip())
     if unit in _PLAIN:
         return _PLAIN[unit]
     plain, slash, per = unit.partition("/")
-    plain, per = _ALSO.get(plain.strip(), plain.strip()), per.strip().replace("^", "").replace("²", "2")
+    plain, per = _SYNONYMS.get(plain.strip(), plain.strip()), per.strip().replace("^", "").replace("²", "2")
     seconds = {"s": 1.0, "s2": 1.0, "h": 3600.0, "min": 60.0}.get(per)
     if not slash or seconds is None or plain not in _PLAIN or _PLAIN[plain][2] or "/" in _PLAIN[plain][0]:
         return None

@@ -1,4 +1,4 @@
-"""Merges recordings into a LeRobot v3 folder, by a mapping file or one that is guessed."""
+"""Merges recordings into a LeRobot v3 folder, by a mapping file or a proposed mapping."""
 
 from __future__ import annotations
 
@@ -27,41 +27,41 @@ def merge_into(
     dry: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[dict, str]:
-    """Merges the sources (path -> Source) into a new LeRobot v3 folder; returns (facts, the same for a person).
+    """Merges the sources (path -> Source) into a new LeRobot v3 folder; returns (facts, the same as text).
 
-    mapping: the file to merge by; None to guess one and write it to OUT.toml, which must not be there yet.
-    fps:     rows a second, before what the mapping says.
-    dry:     stop when the mapping is written.
+    mapping: the mapping file; None proposes a mapping and writes it to OUT.toml, which must not exist yet.
+    fps:     rows per second; overrides the mapping's.
+    dry:     stop once the mapping is written.
 
     The folder also has meta/merge.toml (the mapping), meta/merge.json (the report) and, in meta/terrella.json under
-    "embodiments", each robot's statistics. Where merging fails or is stopped, neither it nor a guessed mapping is left.
+    "embodiments", each robot's statistics. A merge that fails or is stopped leaves neither the folder nor a proposed mapping.
     """
     out = Path(out)
     path = out.parent / f"{out.name}.toml" if mapping is None else Path(mapping)
     if mapping is None:
         if path.exists():
-            raise DatasetError(f"{path} is there already: merge by it (--mapping {path}), or move it away.")
-        found = propose(sources, fps)
-        write_mapping(found, path)
+            raise DatasetError(f"{path} exists already: merge by it (--mapping {path}), or move it away.")
+        plan = propose(sources, fps)
+        write_mapping(plan, path)
     else:
-        found = read_mapping(path)
-        found = replace(found, rows=replace(found.rows, fps=float(fps))) if fps is not None else found
-    check_mapping(found, sources)
+        plan = read_mapping(path)
+        plan = replace(plan, rows=replace(plan.rows, fps=float(fps))) if fps is not None else plan
+    check_mapping(plan, sources)
     if dry:
-        notes = {source.path: list(source.notes) for source in found.sources}
-        said = [f"{source}: {note}" for source, some in notes.items() for note in some]
+        notes = {source.path: list(source.notes) for source in plan.sources}
+        lines = [f"{source}: {note}" for source, some in notes.items() for note in some]
         return {"mapping": str(path), "notes": notes}, "\n".join(
-            [*said, f"the mapping is {path}: edit it, then merge by it"]
+            [*lines, f"the mapping is {path}: edit it, then merge by it"]
         )
     report = MergeReport()
-    terminal = all(_ends_without_action(sources[it.path], it, found) for it in found.sources)
-    merged = merge(sources, found, report, out.name, terminal)
+    terminal = all(_ends_without_action(sources[it.path], it, plan) for it in plan.sources)
+    merged = merge(sources, plan, report, out.name, terminal)
 
     def finish(folder: Path, notes: list[str]) -> None:
         about = json.loads((folder / WORLD).read_text(encoding="utf-8"))
         files.write_json(folder / WORLD, {**about, "embodiments": report.embodiments()})
         files.write_json(folder / "meta" / "merge.json", {**report.to_json(), "notes": notes})
-        write_mapping(found, folder / "meta" / "merge.toml")
+        write_mapping(plan, folder / "meta" / "merge.toml")
 
     try:
         notes = lerobot.write(merged, out, progress=progress, finish=finish)
@@ -75,7 +75,7 @@ def merge_into(
 
 
 def _ends_without_action(origin: Source, source: SourceMapping, mapping: MergeMapping) -> bool:
-    """Whether nothing was done in the last row of its first take (which stands for all)."""
+    """Whether the last row of the source's first take, which stands for all, has no action."""
     take = next(iter(merge({source.path: origin}, replace(mapping, sources=(source,))).takes()), None)
     if take is None or ACTION not in take.readings:
         return True
