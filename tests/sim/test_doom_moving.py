@@ -218,13 +218,13 @@ def test_points_of_a_map_lie_on_its_floor(maps):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("freedoom2", "none was named.*say freedoom2/MAP01"),
+        ("freedoom2", "none is named.*give freedoom2/MAP01"),
         ("freedoom2/MAP77", "MAP77"),
-        ("my_way_home/MAP01", "no maps to choose from here; the games that have are freedoom1"),
-        ("doom2", "does not bring"),
+        ("my_way_home/MAP01", "no maps to choose from; games with maps are freedoom1"),
+        ("doom2", "does not include"),
         ("../secrets", "no scenario"),
         ("", "no scenario"),
-        ("freedoom2/", "none was named"),
+        ("freedoom2/", "none is named"),
     ],
 )
 def test_a_map_that_is_not_there_is_refused_in_one_sentence(name, says):

@@ -15,7 +15,7 @@ import terrella
 from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
 from terrella.core.spec import POSE, POSE_UNIT
-from terrella.sim.environment_loading import follow
+from terrella.sim.environment_loading import use_tracking_camera
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumConfig, GymnasiumWorld
 
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
@@ -474,5 +474,5 @@ def test_mujocos_state_is_copied_where_that_is_asked_for():
 def test_who_runs_in_a_mujoco_environment_stays_in_the_picture(cameras, config, drawn_by):
     model = SimpleNamespace(ncam=len(cameras), camera=lambda number: SimpleNamespace(name=cameras[number]))
     renderer = SimpleNamespace(camera_id=-1, default_cam_config=config, model=model)
-    follow(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
+    use_tracking_camera(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
     assert renderer.camera_id == drawn_by

@@ -10,7 +10,7 @@ from terrella.cli import main
 from terrella.core import check_world, make_rng
 from terrella.library import load
 from terrella.sim import islet, islet_art
-from terrella.sim.islet import SPEED, STRIP, Islet, swing, within_reach
+from terrella.sim.islet import SPEED, STRIP, Islet, swing, reachable
 
 NOOP, UP, DOWN, LEFT, RIGHT = range(5)
 
@@ -19,7 +19,7 @@ def at(x: int, y: int, facing: int = DOWN) -> Islet:
     env = Islet("rgb_array")
     env.reset(seed=0)
     env.x, env.y, env.facing, env.moving = x, y, facing, False
-    env.trail, env.there = [x, y] * (len(env.trail) // 2), np.zeros(len(islet_art.STARS), np.bool_)
+    env.trail, env.stars_left = [x, y] * (len(env.trail) // 2), np.zeros(len(islet_art.STARS), np.bool_)
     return env
 
 
@@ -47,9 +47,9 @@ def test_walls_hold_and_every_place_and_star_can_be_reached():
     for step in range(400):
         action = int(rng.integers(5)) if step % 15 == 0 else action
         env.step(action)
-        assert within_reach()[env.y // SPEED, env.x // SPEED] and env.x % SPEED == env.y % SPEED == 0
+        assert reachable()[env.y // SPEED, env.x // SPEED] and env.x % SPEED == env.y % SPEED == 0
     free = islet._standable()[::SPEED, ::SPEED]
-    assert np.array_equal(free, within_reach()) and free.mean() > 0.3
+    assert np.array_equal(free, reachable()) and free.mean() > 0.3
     rows, columns = np.nonzero(free)
     for x, y in islet_art.STARS:
         assert ((abs(columns * SPEED - x) <= 6) & (abs(rows * SPEED - y) <= 6)).any()
@@ -96,10 +96,10 @@ def test_it_goes_to_and_fro_and_rests():
 def test_a_star_is_found_once_and_lights_up():
     x, y = islet_art.STARS[5]
     env = at(x, y - 12)
-    env.there[5:7] = True
+    env.stars_left[5:7] = True
     dark = env.render()
     rewards = [env.step(action)[1] for action in (DOWN, DOWN, DOWN, DOWN, UP, UP, DOWN, DOWN)]
-    assert sum(rewards) == 1 and env.there.tolist()[5:7] == [False, True]
+    assert sum(rewards) == 1 and env.stars_left.tolist()[5:7] == [False, True]
     assert not np.array_equal(env.render()[:STRIP], dark[:STRIP])
     env.x, env.y = islet_art.STARS[6]
     assert env.step(NOOP)[1:3] == (1.0, True)

@@ -164,7 +164,7 @@ def test_a_file_tells_its_task(arm):
     for kind, key, numbers, why in (
         ("hald", "ring", "1 2", "did you mean 'hold'"),
         ("hold", "rng", "1 2", "did you mean 'ring'"),
-        ("hold", "ring", "1", "is 2 numbers; got 1"),
+        ("hold", "ring", "1", "takes 2 numbers; got 1"),
         ("hold", "dwell", "5", "'hand'; the file has tip"),
     ):
         arm.write_text(ARM.replace("</mujoco>", told.format(kind, key, numbers)))
@@ -174,7 +174,7 @@ def test_a_file_tells_its_task(arm):
         "</mujoco>", told.format("hold", "dwell", "5")
     )
     arm.write_text(file)
-    with pytest.raises(TerrellaError, match="moves freely"):
+    with pytest.raises(TerrellaError, match="free joint"):
         load(f"mujoco:{arm}", cameras=())
     arm.write_text(file.replace("<freejoint/>", ""))
     world = load(f"mujoco:{arm}", cameras=())
@@ -337,7 +337,7 @@ def test_a_small_picture_of_a_fine_mesh_looks_as_before(tmp_path):
     assert isinstance(small, MujocoWorld) and isinstance(large, MujocoWorld)
     seen, fine = (world.render(world.start(1, make_rng(0)), ("rgb",))["rgb"][0].float() for world in (small, large))
     coarse = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 8).permute(1, 2, 0)
-    assert small._pictures._model.mesh_facenum[0] < large._pictures._model.mesh_facenum[0] / 2
+    assert small._renderer._model.mesh_facenum[0] < large._renderer._model.mesh_facenum[0] / 2
     assert (seen - coarse).square().mean().sqrt() < 12  # of 255
     small.close()
     large.close()

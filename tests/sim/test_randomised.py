@@ -87,15 +87,15 @@ def test_actions_come_late_in_any_world():
 UNSOUND = {
     "friction = {uniform = [0.0, 9.0]}": "cannot be randomised safely from 0 to 9.*within 0.05 to 3",
     "frictoin = {uniform = [0.4, 1]}": "no parameter 'frictoin'; did you mean 'friction'",
-    "mass = {uniform = [1.2, 0.8]}": "smaller first",
+    "mass = {uniform = [1.2, 0.8]}": "lower number first",
     "mass = {even = [1, 2]}": "is one of uniform",
     "mass = {uniform = [1]}": "takes 2 numbers",
     "delay = {uniform = [0, 3]}": "whole steps",
     "textures = 2": "cannot be randomised safely from 2 to 2.*within 0 to 1",
     '"camera.roll" = 3': "within -0.5 to 0.5 rad",
-    '"noise.done" = 0.1': "float numbers",
-    "mass": "no TOML",
-    "": "declares no distribution",
+    '"noise.done" = 0.1': "a float channel",
+    "mass": "not TOML",
+    "": "has no distribution",
 }
 
 

@@ -41,19 +41,19 @@ def test_identification_finds_what_differs(pair):
 
 
 def test_a_residual_of_few_episodes_puts_others_right(pair, tmp_path):
-    from terrella.sim.corrected import residuals
+    from terrella.sim.corrected import residual_targets
     from terrella.workflows.transfer_arms import fit_residual
 
     sim, trials = pair
     model = fit_residual(sim, trials[:5], tmp_path / "run", 0)
-    inputs, targets = residuals(sim, trials[5:])
-    left = (model.residual.found(inputs) - targets).square().mean(0)
+    inputs, targets = residual_targets(sim, trials[5:])
+    left = (model.residual.correction(inputs) - targets).square().mean(0)
     assert (left < 0.25 * targets.square().mean(0)).all()
     check_world(model)
 
 
 def test_play_is_learned_from_few_episodes(tmp_path):
-    from terrella.sim.corrected import residuals
+    from terrella.sim.corrected import residual_targets
     from terrella.sim.randomised import Distribution, Randomised
     from terrella.sim.trials import collect
     from terrella.workflows.transfer_arms import fit_residual
@@ -62,8 +62,8 @@ def test_play_is_learned_from_few_episodes(tmp_path):
     real = Randomised(sim, {"backlash": Distribution("constant", (0.1,))})
     trials = collect(real, Random(sim.spec, (1, 9)), 8, 3)
     model = fit_residual(sim, trials[:6], tmp_path / "run", 0)
-    inputs, targets = residuals(sim, trials[6:])
-    left = (model.residual.found(inputs) - targets).square().mean(0)
+    inputs, targets = residual_targets(sim, trials[6:])
+    left = (model.residual.correction(inputs) - targets).square().mean(0)
     assert (left < 0.3 * targets.square().mean(0)).all()  # without the bank of play operators 0.57 to 0.85
 
 
@@ -82,7 +82,7 @@ def test_without_a_residual_a_corrected_world_is_the_world(pair):
 def test_joints_that_are_no_numbers_are_refused():
     from terrella.sim.trials import fitted_simulator
 
-    with pytest.raises(TerrellaError, match="moves freely"):
+    with pytest.raises(TerrellaError, match="free joint"):
         fitted_simulator(load("mujoco:ant", cameras=()))
 
 

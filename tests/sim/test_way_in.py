@@ -119,9 +119,9 @@ def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = load("gym:way_in_toy:WayInToy-v0").spec
     assert spec.max_episode_steps == 7 and spec.dt_s == 0.1
-    with pytest.raises(TerrellaError, match="no Python module 'no_such_module' .* pip install"):
+    with pytest.raises(TerrellaError, match="Python module 'no_such_module' .* pip install"):
         load("gym:no_such_module:Game-v0")
-    with pytest.raises(TerrellaError, match="say which: gym:PACKAGE:ID"):
+    with pytest.raises(TerrellaError, match="name it: gym:PACKAGE:ID"):
         load("gym:someone/Game-v0")
 
 

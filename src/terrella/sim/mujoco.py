@@ -1,7 +1,6 @@
 """Snapshots of MuJoCo environments of Gymnasium, which make them forkable."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations, and gymnasium's Env does not declare `model` and `data`
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Visual randomisation of a MuJoCo scene: textures and colours of surfaces, and distractor objects."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

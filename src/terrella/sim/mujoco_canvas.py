@@ -1,7 +1,6 @@
 """Renders many MuJoCo worlds as tiles of one image, read at once; and simplifies models for small pictures."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

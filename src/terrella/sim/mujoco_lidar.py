@@ -1,7 +1,6 @@
 """LiDAR by ray casting around the site "lidar" of a MuJoCo model."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Loads MJCF and URDF files as MuJoCo models, and adds missing servos, floor and camera."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

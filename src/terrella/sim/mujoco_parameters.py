@@ -1,7 +1,6 @@
 """Parameters that may differ between worlds of one MuJoCo model (masses, friction, gravity, …), and the changed models."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

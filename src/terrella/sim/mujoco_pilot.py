@@ -1,7 +1,6 @@
 """The autopilot of a multirotor: thrusts from commanded velocities."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

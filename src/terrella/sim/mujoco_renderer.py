@@ -1,7 +1,6 @@
 """Renders colour, depth, segmentation and camera poses of MuJoCo worlds; graphics are set up at the first picture."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Ready robots: model files inside wheels, with servos, a rest pose and a task."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 
@@ -171,7 +170,6 @@ def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
 TABLE_M = 0.75  # height of the arm's table
 _LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # axes of its camera
 _LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)
-_BODY = Servo(100.0, 5.0, 88.0, 0.01, 0.6)
 ROBOTS: Mapping[str, Robot] = {
     "go1": Robot(
         ZOO + "unitree_go1/xmls/go1.xml",

@@ -1,7 +1,6 @@
 """Steps batches of physics states with `mujoco.rollout`, on threads, each row with its own model."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

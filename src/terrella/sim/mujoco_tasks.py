@@ -9,12 +9,15 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from gymnasium import spaces
+from torch import Tensor
 
 from ..core import chance
 from ..core.errors import TerrellaError
 from ..core.similar import did_you_mean
 
-Tensors = Mapping[str, torch.Tensor]
+Tensors = Mapping[str, Tensor]
+Evaluation = tuple[Tensor, Tensor, dict[str, Tensor]]  # reward [B], terminated bool [B], the task's tensors
+Spaces = dict[str, tuple[spaces.Space, str]]  # channel -> (space, unit)
 _START, _GOAL = 1, 2  # streams of random numbers
 MARKER = "marker"  # optional tensor of a state: a point [B, 3], m, that is rendered as a ball
 
@@ -25,13 +28,11 @@ class RobotLayout:
 
     qpos: slice  # columns of the physics state
     qvel: slice
-    hinges: tuple[
-        torch.Tensor, torch.Tensor
-    ]  # indices in qpos and in qvel of hinges and slides, without free and ball joints
-    home: torch.Tensor  # qpos [nq] at rest
-    rest: torch.Tensor  # ctrl [nu] at rest
-    low: torch.Tensor  # limits of ctrl [nu]
-    high: torch.Tensor
+    hinges: tuple[Tensor, Tensor]  # indices in qpos and in qvel of hinges and slides, without free and ball joints
+    home: Tensor  # qpos [nq] at rest
+    rest: Tensor  # ctrl [nu] at rest
+    low: Tensor  # limits of ctrl [nu]
+    high: Tensor
     sensors: Mapping[str, slice]  # sensor -> columns of the sensor data
     step_s: float  # seconds of a control step
 
@@ -39,21 +40,17 @@ class RobotLayout:
 class RobotTask(Protocol):
     """A task.
 
-    channels:   name -> (space, unit) of what `render` shows.
+    channels:   the channels that `render` shows.
     initialise: changes the initial qpos [B, nq] and qvel [B, nv] in place; returns the task's own tensors of the state.
-    evaluate:   reward [B], terminated bool [B] and the task's tensors after a step.
+    evaluate:   reward, termination and the task's tensors after a step.
     """
 
     rewards: bool  # whether `reward` is a channel
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]: ...
-    def initialise(
-        self, layout: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
-    ) -> dict[str, torch.Tensor]: ...
-    def evaluate(
-        self, layout: RobotLayout, before: Tensors, after: Tensors
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]: ...
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor: ...
+    def channels(self, layout: RobotLayout) -> Spaces: ...
+    def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]: ...
+    def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation: ...
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor: ...
 
 
 class Free:
@@ -61,7 +58,7 @@ class Free:
 
     rewards = False
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, layout: RobotLayout) -> Spaces:
         width = (
             len(layout.home)
             + layout.qvel.stop
@@ -70,18 +67,14 @@ class Free:
         )
         return {"observation": (numbers(width), "")}
 
-    def initialise(
-        self, layout: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
+    def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
         return {}
 
-    def evaluate(
-        self, layout: RobotLayout, before: Tensors, after: Tensors
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         batch = len(after["physics"])
         return torch.zeros(batch), torch.zeros(batch, dtype=torch.bool), {}
 
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         physics = state["physics"]
         return torch.cat([physics[:, layout.qpos], physics[:, layout.qvel], state["sensors"]], 1).float()
 
@@ -110,7 +103,7 @@ class VelocityTracking:
         }
     )  # fmt: skip
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, layout: RobotLayout) -> Spaces:
         if len(layout.home) < 7 or len(layout.home) != layout.qvel.stop - layout.qvel.start + 1:
             raise TerrellaError(
                 "velocity tracking needs a free body: the first joint of the file must be a free joint."
@@ -124,9 +117,7 @@ class VelocityTracking:
             "velocity": (numbers(3), "m/s, m/s, rad/s"),
         }
 
-    def initialise(
-        self, layout: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
+    def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
         joints = qpos.shape[1] - 7
         drawn = 2 * chance.uniform(seeds, (joints + qvel.shape[1] + 1,), _START).double() - 1
         qpos[:, 7:] += self.noise * drawn[:, :joints]
@@ -138,15 +129,13 @@ class VelocityTracking:
         command = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * chance.uniform(seeds, (3,), _GOAL)
         return {"command": command}
 
-    def evaluate(
-        self, layout: RobotLayout, before: Tensors, after: Tensors
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         height, tilt = self.fallen[1], self.fallen[0]
         up, qpos = motion(layout, after["physics"])[2], after["physics"][:, layout.qpos]
         fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * layout.home[2])
         return self._reward(layout, before, after).clamp_min(0.0).float(), fallen, {"command": after["command"]}
 
-    def _reward(self, layout: RobotLayout, before: Tensors, after: Tensors) -> torch.Tensor:
+    def _reward(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Tensor:
         """The reward of a step [B], before clamping."""
         physics, command, weights = after["physics"], after["command"], self.weights
         qpos, (velocity, spin, up) = physics[:, layout.qpos], motion(layout, physics)
@@ -162,7 +151,7 @@ class VelocityTracking:
             - weights["pose"] * (qpos[:, 7:] - layout.home[7:]).square().sum(1)
         )  # fmt: skip
 
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         if name == "command":
             return state["command"]
         velocity, spin, up = motion(layout, state["physics"])
@@ -187,7 +176,7 @@ class Stepping(VelocityTracking):
     lift_m: float = 0.08  # height of a foot in swing
     straight: tuple[int, ...] = (1, 2, 7, 8)  # joints that should stay at rest, as columns after the free joint
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, layout: RobotLayout) -> Spaces:
         channels = super().channels(layout)
         wanted = [f"{kind}_{foot}" for foot in self.feet for kind in ("foot", "place", "speed")]
         if missing := [name for name in wanted if name not in layout.sensors]:
@@ -196,17 +185,17 @@ class Stepping(VelocityTracking):
             )
         return channels | {"observation": (numbers(channels["observation"][0].shape[0] + 2), "")}
 
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         value = super().render(layout, state, name)
         if name != "observation":
             return value
         angle = 2 * torch.pi * self._phase(state)
         return torch.cat([value, angle.sin()[:, None], angle.cos()[:, None]], 1).float()
 
-    def _phase(self, state: Tensors) -> torch.Tensor:
+    def _phase(self, state: Tensors) -> Tensor:
         return (state["physics"][:, 0] / self.period_s).remainder(1.0)
 
-    def _reward(self, layout: RobotLayout, before: Tensors, after: Tensors) -> torch.Tensor:
+    def _reward(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Tensor:
         reward, sensors, phase = super()._reward(layout, before, after), after["sensors"], self._phase(after)
         for foot, offset in self.feet.items():
             load, place, speed = (sensors[:, layout.sensors[f"{kind}_{foot}"]] for kind in ("foot", "place", "speed"))
@@ -229,7 +218,7 @@ class Reach:
     low: tuple[float, float, float] = (0.2, -0.2, 0.1)  # corners of the box, m
     high: tuple[float, float, float] = (0.45, 0.2, 0.4)
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, layout: RobotLayout) -> Spaces:
         _check_hand(layout, self.hand)
         return {
             "observation": (numbers(sum(map(len, layout.hinges)) + 6), ""),
@@ -237,20 +226,16 @@ class Reach:
             "hand": (numbers(3), "m"),
         }
 
-    def initialise(
-        self, layout: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
+    def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
         low, high = torch.tensor(self.low), torch.tensor(self.high)
         goal = low + (high - low) * chance.uniform(seeds, (3,), _GOAL)
         return {"goal": goal, MARKER: goal.double()}
 
-    def evaluate(
-        self, layout: RobotLayout, before: Tensors, after: Tensors
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         distance = (after["sensors"][:, layout.sensors[self.hand]] - after["goal"]).norm(dim=1)
         return -distance.float(), torch.zeros(len(distance), dtype=torch.bool), {"goal": after["goal"]}
 
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         hand = state["sensors"][:, layout.sensors[self.hand]]
         if name != "observation":
             return state["goal"] if name == "goal" else hand.float()
@@ -272,7 +257,7 @@ class Hold:
     dwell: int = 25  # control steps
     start: tuple[float, float] = (1.5, 0.5)  # range of initial joints and speeds around rest, rad and rad/s
 
-    def channels(self, layout: RobotLayout) -> dict[str, tuple[spaces.Space, str]]:
+    def channels(self, layout: RobotLayout) -> Spaces:
         _check_hand(layout, self.hand)
         joints = len(layout.home)
         if joints != layout.qvel.stop - layout.qvel.start:
@@ -281,9 +266,7 @@ class Hold:
             )
         return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
 
-    def initialise(
-        self, layout: RobotLayout, seeds: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor
-    ) -> dict[str, torch.Tensor]:
+    def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
         drawn = chance.uniform(seeds, (qpos.shape[1] + qvel.shape[1],), _START).double()
         angle, radius = chance.uniform(seeds, (2,), _GOAL).double().unbind(1)
         qpos += self.start[0] * (2 * drawn[:, : qpos.shape[1]] - 1)
@@ -294,16 +277,14 @@ class Hold:
         marker = torch.stack([goal[:, 0], torch.zeros(len(goal)), goal[:, 1]], 1).double()
         return {"goal": goal, MARKER: marker, "held": torch.zeros(len(goal), dtype=torch.int64)}
 
-    def evaluate(
-        self, layout: RobotLayout, before: Tensors, after: Tensors
-    ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
+    def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         distance = self._from_goal(layout, after).norm(dim=1)
         speed = after["physics"][:, layout.qvel].square().sum(1)
         held = torch.where(distance <= self.within, before["held"] + 1, 0)
         reward = torch.exp(-(distance / self.within).square()) - 2 * distance - 0.002 * speed
         return reward.float(), torch.zeros(len(distance), dtype=torch.bool), {"goal": after["goal"], "held": held}
 
-    def render(self, layout: RobotLayout, state: Tensors, name: str) -> torch.Tensor:
+    def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         if name == "success":
             return (state["held"] >= self.dwell).float()
         offset = self._from_goal(layout, state)
@@ -312,7 +293,7 @@ class Hold:
         qpos, qvel = state["physics"][:, layout.qpos], state["physics"][:, layout.qvel]
         return torch.cat([qpos.cos(), qpos.sin(), 0.2 * qvel, state["goal"], 10 * offset], 1).float()
 
-    def _from_goal(self, layout: RobotLayout, state: Tensors) -> torch.Tensor:
+    def _from_goal(self, layout: RobotLayout, state: Tensors) -> Tensor:
         """The vector from the goal to the hand [B, 2], m."""
         return state["sensors"][:, layout.sensors[self.hand]][:, [0, 2]] - state["goal"]
 
@@ -355,7 +336,7 @@ def _check_hand(layout: RobotLayout, hand: str) -> None:
         raise TerrellaError(f"the task needs a framepos sensor named '{hand}'; the file has {sensors}.")
 
 
-def motion(layout: RobotLayout, physics: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def motion(layout: RobotLayout, physics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity in m/s, angular velocity in rad/s and the up direction, each [B, 3] in the free body's frame."""
     turn, velocity = physics[:, layout.qpos][:, 3:7], physics[:, layout.qvel]
     up = torch.zeros_like(velocity[:, :3])
@@ -364,14 +345,14 @@ def motion(layout: RobotLayout, physics: torch.Tensor) -> tuple[torch.Tensor, to
     return rotate(back, velocity[:, :3]), velocity[:, 3:6], rotate(back, up)
 
 
-def rotate(turn: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+def rotate(turn: Tensor, vector: Tensor) -> Tensor:
     """Vectors [B, 3] rotated by quaternions w, x, y, z [B, 4]."""
     w, axis = turn[:, :1], turn[:, 1:]
     twice = 2 * torch.linalg.cross(axis, vector)
     return vector + w * twice + torch.linalg.cross(axis, twice)
 
 
-def quaternion_product(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+def quaternion_product(one: Tensor, other: Tensor) -> Tensor:
     """The rotation by `other`, then by `one`: quaternions w, x, y, z [B, 4]."""
     w = one[:, :1] * other[:, :1] - (one[:, 1:] * other[:, 1:]).sum(1, keepdim=True)
     axis = one[:, :1] * other[:, 1:] + other[:, :1] * one[:, 1:] + torch.linalg.cross(one[:, 1:], other[:, 1:])

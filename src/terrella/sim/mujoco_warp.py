@@ -1,7 +1,6 @@
 """Steps batches of physics states on a GPU with `mujoco-warp` instead of `mujoco.rollout`; see mujoco_stepping.py."""
 
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
-# mujoco-warp is an extra
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """MujocoWorld: thousands of worlds of one MuJoCo model in one State, stepped in parallel by `mujoco.rollout` on CPU threads."""
 
 # pyright: reportAttributeAccessIssue=false
-# mujoco is a compiled module without declarations
 
 from __future__ import annotations
 

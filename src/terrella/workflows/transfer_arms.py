@@ -22,7 +22,7 @@ from ..learn.objectives.regression import Regression, drawn_rows
 from ..learn.recipes.policy import Practice, train_policy
 from ..learn.trainer import Run, Trainer
 from ..measure.transfer_scores import FLOORS, IDLE, RANDOM
-from ..sim.corrected import Corrected, Residual, residuals
+from ..sim.corrected import Corrected, Residual, residual_targets
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld
 from ..sim.randomised import Randomised, read
@@ -161,7 +161,7 @@ class _SeedRun:
         actor = Actor.load(policy, self.sim.spec, greedy=False)
         noisy, seed = NoisyPolicy(actor, RANDOM_ACTIONS, self.sim.spec), GATHERED + self.seed + 1000 * number
         blocks = (collect(self.real, noisy, GATHER, seed + 1_000_000 * at) for at in range(-(-count // GATHER)))
-        return reduce(Trials.and_then, blocks)[:count]
+        return reduce(Trials.joined_with, blocks)[:count]
 
     def model(self, count: int) -> tuple[World, Path]:
         """The model of `count` real episodes, and the policy that gathered the last of them. They are gathered in rounds, because
@@ -175,7 +175,7 @@ class _SeedRun:
         for number, share in enumerate(shares):
             name = f"{count}, round {number + 1}"
             if number:
-                trials = trials.and_then(self._gathered(policy, share, number))
+                trials = trials.joined_with(self._gathered(policy, share, number))
             residual = self.folder / f"residual {name}"
             model = fit_residual(fitted_simulator(self.sim), trials, residual, self.seed)
             if number + 1 < len(shares):
@@ -194,10 +194,10 @@ class _SeedRun:
 def fit_residual(sim: MujocoWorld, trials: Trials, folder: Path, seed: int, mark: str = "") -> Corrected:
     """The simulator with a residual that is fitted to the trials; it continues where it was stopped. TrainingError where the
     folder holds a residual of another mark."""
-    inputs, targets = residuals(sim, trials)
+    inputs, targets = residual_targets(sim, trials)
     torch.manual_seed(seed)
     network = Residual(sim.file.nq, sim.file.nu)
-    network.settle(inputs, targets)
+    network.fit_scales(inputs, targets)
     facts: Mapping[str, Any] = {
         "episodes": len(trials.actions),
         "rows": len(inputs),

@@ -24,7 +24,7 @@ from ..measure.statistics import Figure, mean_interval
 from ..sim.identification import identify
 from ..sim.mujoco_world import MujocoWorld
 from ..sim.randomised import Randomised, read
-from ..sim.trials import PAST, Trials, fitted_simulator, idle, placed
+from ..sim.trials import PAST, Trials, fitted_simulator, idle_actions, with_joints
 from .real_environment import meaning_difference
 from .results import jsonable, table_lines
 from .transfer_arms import fit_residual
@@ -140,7 +140,7 @@ def read_trials(dataset: Dataset, world: MujocoWorld) -> Trials:
     known = torch.tensor([[step < len(one["action"]) - 1 for step in range(rows - 1)] for one in episodes])
     low, high = (torch.as_tensor(limit) for limit in spec.action_limits)
     actions = padded("action", rows - 1).clamp(low, high)
-    return Trials(padded("qpos", rows), padded("qvel", rows), actions, known, idle(spec, len(episodes)))
+    return Trials(padded("qpos", rows), padded("qvel", rows), actions, known, idle_actions(spec, len(episodes)))
 
 
 def _halves(trials: Trials, count: int) -> tuple[Trials, Trials]:
@@ -154,7 +154,7 @@ def open_loop(world: World | None, held: Trials, seed: int) -> dict[int, Figure]
     """horizon -> RMS error of the joints under the recorded actions; without a world, of standing still."""
     batch, state = len(held.actions), None
     if world is not None:
-        state = placed(
+        state = with_joints(
             world, world.start(batch, make_rng(seed)), held.actions[:, :PAST], held.qpos[:, PAST], held.qvel[:, PAST]
         )
     errors = {}
@@ -162,7 +162,7 @@ def open_loop(world: World | None, held: Trials, seed: int) -> dict[int, Figure]
         at = PAST + step
         if state is not None and world is not None:
             state = world.imagine(state, held.actions[:, at], make_rng(seed))
-        known = held.known[:, : at + 1].all(1)
+        known = held.valid[:, : at + 1].all(1)
         if step + 1 in HORIZONS and known.any():
             mine = held.qpos[:, PAST] if world is None or state is None else world.render(state, ("qpos",))["qpos"]
             away = (mine - held.qpos[:, at + 1]).square().mean(1).sqrt()[known]
@@ -174,11 +174,11 @@ def open_loop(world: World | None, held: Trials, seed: int) -> dict[int, Figure]
 def agreement(world: World, held: Trials, seed: int) -> Figure:
     """Distance between the recorded action and the one that brings the world nearest to the next recorded moment, in shares of the
     range, over some moments."""
-    rng, rows = make_rng(seed), held.known[:, PAST:].nonzero()
+    rng, rows = make_rng(seed), held.valid[:, PAST:].nonzero()
     episode, at = rows[torch.randint(len(rows), (MOMENTS,), generator=rng)].T
     at, past = at + PAST, held.past()
     each = torch.arange(len(at)).repeat_interleave(CANDIDATES)
-    state = placed(
+    state = with_joints(
         world,
         world.start(len(each), rng),
         past[episode, at][each],
@@ -187,7 +187,7 @@ def agreement(world: World, held: Trials, seed: int) -> Figure:
     )
     tried = world.spec.sample_action(len(each), rng)
     after = world.render(world.imagine(state, tried, rng), ("qpos", "qvel"))
-    unit = {name: getattr(held, name)[:, :-1][held.known].std(0).clamp_min(1e-6) for name in ("qpos", "qvel")}
+    unit = {name: getattr(held, name)[:, :-1][held.valid].std(0).clamp_min(1e-6) for name in ("qpos", "qvel")}
     away = sum(
         ((after[name] - getattr(held, name)[episode, at + 1][each]) / unit[name]).square().mean(1) for name in unit
     )
@@ -196,10 +196,10 @@ def agreement(world: World, held: Trials, seed: int) -> Figure:
 
 
 def _baselines(world: World, held: Trials, seed: int) -> dict[str, Figure]:
-    actions = held.actions[held.known]
+    actions = held.actions[held.valid]
     return {
         RANDOM: _apart(world, world.spec.sample_action(len(actions), make_rng(seed)), actions, seed),
-        IDLE: _apart(world, idle(world.spec, len(actions)), actions, seed),
+        IDLE: _apart(world, idle_actions(world.spec, len(actions)), actions, seed),
     }
 
 

@@ -19,12 +19,7 @@ CLICKS = ("mouse_left", "mouse_right")
 _X = (2, 4, 10, 20, 30, 60, 100, 200, 300, 500, 1000)
 _Y = (2, 4, 10, 20, 50, 100, 200)
 MOUSE_X, MOUSE_Y = (tuple(sorted({*half, 0, *(-step for step in half)})) for half in (_X, _Y))
-ACTION = (
-    *KEYS,
-    *CLICKS,
-    *(f"mouse_x={step}" for step in MOUSE_X),
-    *(f"mouse_y={step}" for step in MOUSE_Y),
-)
+ACTION = (*KEYS, *CLICKS, *(f"mouse_x={step}" for step in MOUSE_X), *(f"mouse_y={step}" for step in MOUSE_Y))
 AUX = tuple(
     f"{back}_ago.{name}"
     for back in (1, 2, 3)

@@ -89,13 +89,7 @@ class McapRecording:
     """
 
     def __init__(
-        self,
-        path: Path,
-        sensors: Mapping[str, Sensor],
-        source: Source,
-        take: Take,
-        zero_ns: int,
-        jpeg: bool = False,
+        self, path: Path, sensors: Mapping[str, Sensor], source: Source, take: Take, zero_ns: int, jpeg: bool = False
     ):
         self._sensors = sensors
         self._encoders = {name: MessageEncoder(sensor, jpeg) for name, sensor in sensors.items()}
