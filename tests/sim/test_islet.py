@@ -10,7 +10,7 @@ from terrella.cli import main
 from terrella.core import check_world, make_rng
 from terrella.library import load
 from terrella.sim import islet, islet_art
-from terrella.sim.islet import SPEED, STRIP, Islet, swing, reachable
+from terrella.sim.islet import SPEED, STRIP, Islet, reachable, swing
 
 NOOP, UP, DOWN, LEFT, RIGHT = range(5)
 

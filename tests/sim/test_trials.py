@@ -95,5 +95,5 @@ def test_the_simulator_inside_all_wrappers_is_seen_and_no_other_attribute(pair):
     wrapped = Randomised(Corrected(sim, Residual(2, 2)), {"delay": Distribution("constant", (1.0,))})
     assert fitted_simulator(wrapped) is sim
     other = SimpleNamespace(world=sim, spec=sim.spec)
-    with pytest.raises(TerrellaError, match="is no simulator of MuJoCo"):
+    with pytest.raises(TerrellaError, match="is not a MuJoCo simulator"):
         fitted_simulator(other)

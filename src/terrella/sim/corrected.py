@@ -17,6 +17,7 @@ from ..core.state import State
 from ..core.world import make_rng
 from .mujoco_world import MujocoWorld
 from .trials import PAST, PLAYS, Trials, idle_actions, play_operators, with_joints
+from .wrapper import WorldWrapper
 
 MEMBERS, HIDDEN = 4, 64
 _PAST = "corrected.past"
