@@ -46,9 +46,9 @@ WITHIN = 0.05  # default distance at which a goal is reached, where it is no pla
 class PlanConfig:
     """Settings of `plan`."""
 
-    # What to reach. `reward`: the highest return. A picture file. Numbers: the state, as in 0.5,_,0 (_ matches any value; write
-    # --goal=-1,0 if the first is negative). CHANNEL=VALUE. The folder of a recording, in a world with places: each episode walks
-    # to one of the recorded views.
+    # What to reach. `reward`: the highest return. A picture file. Numbers: the state, as in 0.5,_,0, where _ matches any value;
+    # write --goal=-1,0 if the first is negative. CHANNEL=VALUE. The folder of a recording, in a world with places: each episode
+    # walks to one of the recorded views.
     goal: str = REWARD
     # Distance at which the goal is reached: for numbers a share of their range and for pictures a share of full brightness
     # (default 0.05), for places metres (default 0.5).
@@ -72,7 +72,7 @@ class PlanConfig:
     steps: int | None = None
     """Steps per episode at most; default: the environment's limit, else 200, or 30 s to walk to a place."""
     curve: bool = True
-    """Plan again with a half, a quarter, ... of the samples, or of --budget-ms, to see whether more compute helps."""
+    """Plan again with a half, a quarter, ... of --samples or --budget-ms, to see whether more compute helps."""
     out: Path | None = None
     """Folder for the page, the film and plan.json; default: plans/ and the world's name."""
     device: Device = "auto"

@@ -24,30 +24,30 @@ Kind = Literal["cem", "icem", "mppi", "gradient", "tree", "random"]
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """How a planner searches for plans, and how much of a plan it executes. Counts of 0 take a default."""
+    """How a planner searches for plans, and how much of a plan it executes."""
 
-    # The search method. icem: CEM with coloured noise and kept elites (Pinneri et al. 2020). cem: the cross-entropy method
-    # (Rubinstein 1999, as in PETS). mppi: Williams et al. 2017, over elites as in TD-MPC2. gradient: Adam on the actions, in
+    # The search method. icem: CEM with coloured noise and kept elites (Pinneri et al. 2020). cem: the cross-entropy method of
+    # Rubinstein (1999), as in PETS. mppi: Williams et al. (2017), over elites as in TD-MPC2. gradient: Adam on the actions, in
     # differentiable worlds. tree: beam search, for discrete actions. random: random shooting.
     search: Kind = "icem"
     samples: int = 0
-    """Candidate plans per round. 0: 64, or 32 to walk to a place. A tree expands samples x iterations moves per depth."""
+    """Candidate plans per round. 0 means 64, or 32 to walk to a place. A tree expands samples x iterations moves per depth."""
     iterations: int = 0
-    """Rounds per decision. 0: 5, or 1 to walk to a place."""
+    """Rounds per decision. 0 means 5, or 1 to walk to a place."""
     horizon: int = 0
-    """Moves per plan. 0: 12, or 4 to walk to a place."""
+    """Moves per plan. 0 means 12, or 4 to walk to a place."""
     block: int = 0
-    """Environment steps for which each move is held. 0: 1, or 0.115 s of them to walk to a place."""
+    """Environment steps for which each move is held. 0 means 1 step, or 0.115 s to walk to a place."""
     replan: int = 0
-    """Moves that are executed before the next plan is made. 0: 1, or the whole plan with the cost `last`."""
+    """Moves that are executed before the next plan is made. 0 means 1, or the whole plan with the cost `last`."""
     # Milliseconds per decision, in place of `iterations`; at least one round is done. Results then depend on the speed of the
     # machine: the same seed need not give the same plan.
     budget_ms: float | None = None
-    # Plans are cut short at the step where half of the candidates exceed this value of the world's channel `uncertainty`. None:
-    # never; `terrella plan` then takes the value from which the world invents, if the world declares one.
+    # A plan is cut short at the step where half of the candidates exceed this value of the world's channel `uncertainty`. Without
+    # it, `terrella plan` and the policy `plan` use the threshold that the world declares, if any.
     trust: float | None = None
     elites: int = 0
-    """Best candidates of a round, to which the sampling distribution is fitted. 0: an eighth of the samples."""
+    """Best candidates of a round, to which the sampling distribution is fitted. 0 means an eighth of the samples."""
     spread: float = 0.5
     """Initial standard deviation of an action axis, as a share of half its range."""
     momentum: float = 0.1
