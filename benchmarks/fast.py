@@ -18,7 +18,7 @@ import torch
 import tyro
 
 import terrella
-from terrella.worlds.fast import COMPILED, EAGER, ONNX, compiled, example, through_onnx
+from terrella.worlds.fast import COMPILED, EAGER, ONNX, compiled_forward, example_inputs, onnx_forward
 
 DREAM = 32  # steps after which two ways' frames are compared
 
@@ -54,10 +54,10 @@ def main(
 def ways_of(learned, compile: bool) -> tuple[dict[str, Callable], dict[str, float]]:
     """Each way of drawing, warm, and the seconds that it took to make."""
     vars(learned.generator).pop("forward", None)
-    given, eager = example(learned), learned.generator.forward
-    makers = {EAGER: lambda: eager, ONNX: lambda: through_onnx(learned.generator, given)}
+    given, eager = example_inputs(learned), learned.generator.forward
+    makers = {EAGER: lambda: eager, ONNX: lambda: onnx_forward(learned.generator, given)}
     if compile:
-        makers[COMPILED] = lambda: compiled(learned.generator)
+        makers[COMPILED] = lambda: compiled_forward(learned.generator)
     ways, took = {}, {}
     for name, make in makers.items():
         begun = time.perf_counter()
@@ -70,7 +70,7 @@ def ways_of(learned, compile: bool) -> tuple[dict[str, Callable], dict[str, floa
 
 def timed(learned, ways: dict[str, Callable], threads: int, turns: int) -> list[dict]:
     """Milliseconds of the network alone and of the whole step, one frame of each way after the other."""
-    given, network = example(learned), {name: [] for name in ways}
+    given, network = example_inputs(learned), {name: [] for name in ways}
     with torch.inference_mode():
         for _ in range(turns):
             for name, way in ways.items():
@@ -118,7 +118,7 @@ def row_of(threads: int, what: str, way: str, times: list[tuple[float, float]]) 
 def likeness(learned, ways: dict[str, Callable]) -> dict[str, dict]:
     """Of each way beside eager torch: the largest difference of one frame in [-1, 1], and of the pixel values that a dream
     of DREAM steps shows, the share that differ, the largest difference in levels of 255 and the PSNR."""
-    given, dreams, frames = example(learned), {}, {}
+    given, dreams, frames = example_inputs(learned), {}, {}
     for name, way in ways.items():
         with torch.inference_mode():
             frames[name] = way(*given)

@@ -157,7 +157,7 @@ def main() -> None:
         CLIPS: places(world, cache, given.clips, 0, max(HORIZONS)),
         LONG: places(world, cache, DRIFT_CLIPS, 1, DRIFT),
     }
-    closing = {"last frame only": bare.with_memory_of(0)}
+    closing = {"last frame only": bare.with_memory_budget(0)}
     exam = Exam(arms, sets, ExamConfig(horizons=HORIZONS), album=Album.of_cache(cache), closing=closing)
     with progress.shown("scoring") as report:
         tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731

@@ -17,7 +17,7 @@ from terrella.learn.trainer import Run
 from terrella.space.camera import planar_pose, rays, rotation, yaw
 from terrella.space.floorplan import slide
 from terrella.space.keyframes import Keyframes
-from terrella.worlds.body import Motion, turned
+from terrella.worlds.body import Motion, rotate
 from terrella.worlds.config import MotionConfig
 
 CAMERA, HALF_ROOM = (0.5, 0.8, 0.5, 0.5), 3.0
@@ -65,7 +65,7 @@ def walks(episodes: int = 90, length: int = 40) -> Recording:
             poses.append(planar_pose(place[:, 0], place[:, 1], torch.full((1,), 1.3), heading))
             actions.append(held)
             heading = heading + TURN * (held[1] - held[2])
-            wish = DRAG * speed + turned(torch.tensor([[THRUST, 0.0]]) * held[0], heading)
+            wish = DRAG * speed + rotate(torch.tensor([[THRUST, 0.0]]) * held[0], heading)
             moved, speed = slide(WALLS, place, wish, BODY, SHORT)
             place = place + moved
     total = episodes * length
@@ -90,7 +90,7 @@ def test_drag_thrust_turning_and_body_come_out_of_the_recording(tmp_path):
     acts = torch.tensor([1.0, 1.0, 0.0]).expand(1, 3, 3)
     with torch.no_grad():
         heading, wish = motion(torch.tensor([0.5]), torch.tensor([[0.1, -0.1]]), acts)
-        truth = DRAG * torch.tensor([[0.1, -0.1]]) + turned(torch.tensor([[THRUST, 0.0]]), torch.tensor([0.5 + TURN]))
+        truth = DRAG * torch.tensor([[0.1, -0.1]]) + rotate(torch.tensor([[THRUST, 0.0]]), torch.tensor([0.5 + TURN]))
         assert heading.item() == pytest.approx(0.5 + TURN, abs=0.003)
         assert (wish - truth).abs().max() < 0.004
         assert motion.ends(torch.zeros(1, 2), torch.zeros(1, 3)).item() < -10, "nothing was seen to end"

@@ -22,7 +22,7 @@ from terrella.learn.recipes.parts import ObjectsTraining, train_objects
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
 from terrella.learn.trainer import TrainStep
-from terrella.worlds.body import climbed
+from terrella.worlds.body import follow_stairs
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
@@ -205,6 +205,6 @@ def test_the_other_side_of_a_button():
 def test_a_body_rises_with_the_recorded_ground_and_stays_where_it_stands():
     levels = torch.tensor([[0.0, 0, 1], [2.0, 0, 2]])  # a step up of a metre within two
     here, ahead, z = torch.tensor([[0.5, 0.0]]), torch.tensor([[0.8, 0.0]]), torch.tensor([1.4])
-    assert climbed(levels, here, here, z).item() == pytest.approx(1.4)
-    assert 1.4 < climbed(levels, ahead, ahead + 0.2, z).item() < 1.71
-    assert climbed(levels + 100, here, ahead, z).item() == pytest.approx(1.4), "none is near"
+    assert follow_stairs(levels, here, here, z).item() == pytest.approx(1.4)
+    assert 1.4 < follow_stairs(levels, ahead, ahead + 0.2, z).item() < 1.71
+    assert follow_stairs(levels + 100, here, ahead, z).item() == pytest.approx(1.4), "none is near"

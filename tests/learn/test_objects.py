@@ -92,9 +92,9 @@ def test_who_is_shot_at_falls_and_who_is_not_walks_on(learned):
     card, acts = objects.begun[:1, 0].clone(), torch.zeros(1, 3, 2)
     assert tall[int(card[0, LOOK])]
     with torch.no_grad():
-        calm = objects.foresee(card, pose(1), acts)
+        calm = objects.next_logits(card, pose(1), acts)
         acts[0, -1, 0] = 1
-        shot = objects.foresee(card, pose(1), acts)
+        shot = objects.next_logits(card, pose(1), acts)
     assert not objects.follows[1 + int(card[0, LOOK])].all()
     falls = [float(told.look.softmax(1)[0, ~tall].sum()) for told in (calm, shot)]
     assert falls[0] < 0.1 < 0.7 < falls[1]

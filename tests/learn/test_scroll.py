@@ -49,7 +49,7 @@ def test_what_a_button_does_to_the_picture_is_learned(tmp_path, monkeypatch):
     piece = objective.clips_at(objective.rows[::7])
     went = piece.explained[:, : SLOTS - 1].flip(1)
     with torch.no_grad():
-        guess = least_off(made(made.glanced(piece.frames[:, 0]), piece.context[:, 0], went), MOVES)
+        guess = least_off(made(made.frame_features(piece.frames[:, 0]), piece.context[:, 0], went), MOVES)
     right = guess == piece.explained[:, SLOTS - 1].argmax(1)
     assert right.float().mean() > 0.85, "going on as before would be right in two of three"
 
@@ -70,7 +70,7 @@ def test_a_game_that_never_scrolls_is_not_learned_from(tmp_path):
     assert all(torch.equal(weight, before[name]) for name, weight in made.state_dict().items())
     frames = torch.randint(0, 256, (2, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
     went = torch.rand(2, SLOTS - 1, len(MOVES), generator=make_rng(1))
-    assert not least_off(made(made.glanced(frames), torch.zeros(2, 36 + 2 * SLOTS), went), MOVES).any()
+    assert not least_off(made(made.frame_features(frames), torch.zeros(2, 36 + 2 * SLOTS), went), MOVES).any()
 
 
 def test_in_doubt_the_picture_goes_the_middle_way():

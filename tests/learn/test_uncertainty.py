@@ -35,7 +35,7 @@ from terrella.space.camera import planar_pose
 from terrella.space.estimator import load_estimator
 from terrella.worlds.checkpoint import data_file
 from terrella.worlds.folder import load_world
-from terrella.worlds.uncertainty import CLUES, KNOTS, SITUATION
+from terrella.worlds.uncertainty import INPUT_MAPS, KNOTS, SITUATION
 
 from ..data.layouts import layout_of
 
@@ -153,7 +153,7 @@ def test_dreams_are_those_of_the_seed_and_of_all_kinds(corridor, bare):
     assert [ARMS[int(part.arm[0])] for part in first] == ["memory", "holes", "no memory"]
     for one, two in zip(first, second):
         assert torch.equal(one.error, two.error) and torch.equal(one.clues, two.clues)
-        assert one.clues.shape == (6, CLUES, 6, 8) and one.situation.shape == (6, SITUATION)
+        assert one.clues.shape == (6, INPUT_MAPS, 6, 8) and one.situation.shape == (6, SITUATION)
         assert (one.error > 0).all() and torch.allclose(one.cells.mean((1, 2)), one.error, atol=1e-5)
     assert first[2].episode.tolist() == [4, 5] * 3
 
@@ -200,7 +200,7 @@ def made_up(count: int, seed: int) -> DreamFrames:
     situation = torch.zeros(count, SITUATION)
     situation[:, 0] = level
     error = (0.01 + 0.2 * level**2) * (0.7 + 0.6 * torch.rand(count, generator=rng))
-    maps = torch.rand(count, CLUES, 6, 8, generator=rng).half()
+    maps = torch.rand(count, INPUT_MAPS, 6, 8, generator=rng).half()
     arms = torch.where(level < 0.5, ARMS.index("memory"), ARMS.index("no memory"))
     return DreamFrames(maps, situation, error[:, None, None].expand(-1, 3, 4), error, torch.arange(count), arms)
 

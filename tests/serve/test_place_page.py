@@ -21,7 +21,7 @@ from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import rasterise
 from terrella.workflows.splat_places import compared_scene, unedited_scene
 from terrella.worlds.splat import SolidBoxes, SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import checked_edits, merging, read_edits, save_splat, write_edits
+from terrella.worlds.splat_folder import checked_edits, merge_edit, read_edits, save_splat, write_edits
 
 from ..space.test_fitting import LENS, SIZE, room
 from .test_page import until as within
@@ -148,7 +148,7 @@ def merged(tmp_path, count: int, edits=()):
     """A world's folder that another one was merged into, after which it was edited."""
     save_splat(world(count), tmp_path / "w")
     save_splat(world(600), tmp_path / "other")
-    lines = [merging(tmp_path / "w", tmp_path / "other", (6, 0.3, 0.1), 33), *edits]
+    lines = [merge_edit(tmp_path / "w", tmp_path / "other", (6, 0.3, 0.1), 33), *edits]
     write_edits(tmp_path / "w", lines)
     return tmp_path / "w"
 
@@ -184,7 +184,7 @@ def test_known_walls_of_merged_places_are_met_as_in_python(tmp_path, opened):
     )
     for name in ("w", "other"):
         save_splat(walled_by(full, boxes), tmp_path / name)
-    write_edits(tmp_path / "w", [merging(tmp_path / "w", tmp_path / "other", (9, 1, 0.1), -90)])
+    write_edits(tmp_path / "w", [merge_edit(tmp_path / "w", tmp_path / "other", (9, 1, 0.1), -90)])
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
     page, after = opened((tmp_path / "place.html").as_uri()), load(tmp_path / "w")
     assert isinstance(after, SplatWorld) and len(after.solids) == 6
@@ -387,7 +387,7 @@ def test_a_server_keeps_the_edits(tmp_path, opened, serving):
 def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, serving):
     for name, many in (("w", 1500), ("other", 600)):
         save_splat(world(many), tmp_path / name)
-    folder, merge = tmp_path / "w", merging(tmp_path / "w", tmp_path / "other")
+    folder, merge = tmp_path / "w", merge_edit(tmp_path / "w", tmp_path / "other")
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
     beside = compared_scene(str(tmp_path / "other"))
     url = serving(

@@ -9,7 +9,7 @@ from terrella.core.world import make_rng
 from terrella.space.camera import planar_pose
 from terrella.space.keyframes import Keyframes, look, retrieve
 from terrella.space.reproject import carry_things, carry_things_slowly
-from terrella.worlds.carried_frames import Frame, carry_frames, still
+from terrella.worlds.carried_frames import Frame, carry_frames, static_depth
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (24, 32)
 
@@ -52,7 +52,7 @@ def test_memory_keeps_the_wall_and_not_the_thing():
     `still` there is."""
     frame, pose = scene(), at((0.0, 0.75, 0.0))
     found = {}
-    for name, depth in (("kept", still(frame.depth, frame.things)), ("all", frame.depth)):
+    for name, depth in (("kept", static_depth(frame.depth, frame.things)), ("all", frame.depth)):
         keys = Keyframes.of(frame.rgb, depth, frame.pose, CAMERA)
         found[name] = look(keys, retrieve(keys, pose, CAMERA, SIZE, 1), pose, CAMERA, SIZE, 1)
     kept = found["kept"]
@@ -63,7 +63,7 @@ def test_memory_keeps_the_wall_and_not_the_thing():
 
 def test_a_keyframe_of_nothing_but_things_says_nothing():
     frame = scene(slice(0, 24), slice(0, 32))
-    keys = Keyframes.of(frame.rgb, still(frame.depth, frame.things), frame.pose, CAMERA)
+    keys = Keyframes.of(frame.rgb, static_depth(frame.depth, frame.things), frame.pose, CAMERA)
     assert (keys.walls.abs() >= 1e5).all()
     assert look(keys, torch.tensor([[0]]), at((0.0, 0.3, 0.0)), CAMERA, SIZE, 1).known.sum() == 0
 

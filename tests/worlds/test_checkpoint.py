@@ -19,7 +19,7 @@ from terrella.worlds.checkpoint import data_file, read_about, read_data, write_c
 from terrella.worlds.controls import Controls
 from terrella.worlds.folder import load_world, open_world, save_keys, save_world
 from terrella.worlds.splat import SplatConfig
-from terrella.worlds.splat_folder import save_splat, source_of, world_of
+from terrella.worlds.splat_folder import load_source, save_splat, world_of
 
 from ..space.test_fitting import room
 from .made import place
@@ -98,7 +98,7 @@ def test_a_place_of_gaussians_is_replaced_whole_too(tmp_path):
     seen, point, died = set(), 0, True
     while died:
         died = killed_before(point, lambda: save_splat(worlds[1], folder))
-        place = source_of(folder)
+        place = load_source(folder)
         assert len(place.gaussians) == place.card["count"], "a mixture of places"
         seen.add(place.card["count"])
         if died and place.card["count"] == 300:

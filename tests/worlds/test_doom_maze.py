@@ -82,7 +82,7 @@ def test_without_its_recordings_it_remembers_what_it_was_shown_and_dreamt(world)
     seen = {name: shown[name] for name in ("depth", "pose")} | {"rgb": shown["rgb"].permute(0, 2, 3, 1)}
     start, likeness = seen["pose"][:, :3], {}
     for name, budget_mb in (("own", 16.0), ("last frame", 0.0)):
-        alone, rng = world.without_memory().with_memory_of(budget_mb), terrella.make_rng(0)
+        alone, rng = world.without_memory().with_memory_budget(budget_mb), terrella.make_rng(0)
         state = alone.observe(seen, None, rng)
         far = None
         for step in [*range(1, 13), *range(11, -1, -1)]:

@@ -17,7 +17,7 @@ from terrella.worlds import fast
 from terrella.worlds.carried_frames import PLANES
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
-from terrella.worlds.fast import EAGER, ONNX, compiled, example, quickened, through_onnx
+from terrella.worlds.fast import EAGER, ONNX, compiled_forward, example_inputs, onnx_forward, with_faster_generator
 from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import Conditioning, UNet, generate
 from terrella.worlds.learned import About, LearnedWorld
@@ -32,7 +32,7 @@ def worlds():
     """The bundled world, eager and through ONNX Runtime."""
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
     eager, quick = terrella.load("doom-maze"), terrella.load("doom-maze")
-    quick.generator.forward = through_onnx(quick.generator, example(quick))
+    quick.generator.forward = onnx_forward(quick.generator, example_inputs(quick))
     return eager, quick
 
 
@@ -66,7 +66,7 @@ def walk(world, batch: int, steps: int):
 @pytest.mark.parametrize("batch", [1, 3])
 def test_one_frame_is_that_of_eager_torch(worlds, batch):
     eager, quick = worlds
-    noisy, time, conditioning = example(eager)
+    noisy, time, conditioning = example_inputs(eager)
     noise = torch.randn(batch, *noisy.shape[1:], generator=make_rng(1))
     given = (noise, time.repeat(batch), repeated(conditioning, batch))
     with torch.inference_mode():
@@ -91,7 +91,7 @@ def test_every_kind_of_generator_is_drawn_alike(kind):
         conditioning = Conditioning(glimpse, some(4 + PLANES * config.moving, 32, 48), some(config.generator.context))
         return some(4, 32, 48), some(), conditioning
 
-    quick = through_onnx(generator, given(1))
+    quick = onnx_forward(generator, given(1))
     with torch.inference_mode():
         for batch in (1, 4):
             inputs = given(batch)
@@ -110,9 +110,9 @@ def test_a_dream_of_32_steps_is_that_of_eager_torch(worlds):
 def test_the_faster_way_is_taken_and_said(monkeypatch):
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
     for times, way in (((9.0, 4.0), ONNX), ((4.0, 9.0), EAGER)):
-        monkeypatch.setattr(fast, "in_turns", lambda ways, taken=times: list(taken))
+        monkeypatch.setattr(fast, "alternating_ms", lambda ways, taken=times: list(taken))
         world = small_world()
-        quick, choice = quickened(world)
+        quick, choice = with_faster_generator(world)
         assert choice.way == way and quick.spec.card["fast"] == str(choice)
         assert ("forward" in vars(quick.generator)) == (way == ONNX)
         assert "eager torch" in str(choice)
@@ -121,14 +121,14 @@ def test_the_faster_way_is_taken_and_said(monkeypatch):
 
 def test_a_quickened_world_keeps_the_contract_and_its_weights(monkeypatch):
     pytest.importorskip("onnxruntime", reason="ONNX Runtime is not installed: pip install 'terrella[fast]'")
-    monkeypatch.setattr(fast, "in_turns", lambda ways: [2.0, 1.0])
+    monkeypatch.setattr(fast, "alternating_ms", lambda ways: [2.0, 1.0])
     eager = small_world()
-    world, _ = quickened(eager)
+    world, _ = with_faster_generator(eager)
     assert {"states_are_values", "batches"} <= set(check_world(world))
     assert world.generator.state_dict().keys() == eager.generator.state_dict().keys(), "it can be saved as it was"
     for one, other in zip(walk(eager, 2, 8), walk(world, 2, 8)):
         assert (one["frames"].int() - other["frames"].int()).abs().max() <= 1
-    noisy, time, conditioning = example(world)
+    noisy, time, conditioning = example_inputs(world)
     noisy.requires_grad_(True)
     world.generator(noisy, time, conditioning).mean().backward()
     assert noisy.grad is not None and noisy.grad.abs().max() > 0, "a gradient comes from eager torch"
@@ -136,7 +136,7 @@ def test_a_quickened_world_keeps_the_contract_and_its_weights(monkeypatch):
 
 def test_it_keeps_to_the_threads_that_torch_has(worlds):
     quick, threads = worlds[1], torch.get_num_threads()
-    given = example(quick)
+    given = example_inputs(quick)
     try:
         frames = []
         for count in (1, 2, 1):
@@ -153,7 +153,7 @@ def test_without_the_packages_a_sentence_says_what_to_install(monkeypatch):
     for absent, said in ((("onnx",), "needs onnx: "), (("onnx", "onnxruntime"), "needs onnxruntime and onnx: ")):
         monkeypatch.setattr(fast, "find_spec", lambda name, absent=absent: None if name in absent else True)
         with pytest.raises(TerrellaError, match=said + r"pip install 'terrella\[fast\]'"):
-            quickened(world)
+            with_faster_generator(world)
 
 
 def test_fast_is_for_learned_worlds(capsys):
@@ -171,7 +171,7 @@ def test_other_batches_than_the_compiled_one_are_drawn_eagerly(monkeypatch):
 
     monkeypatch.setattr(torch, "compile", compiler)
     world = small_world()
-    quick, given = compiled(world.generator), example(world)
+    quick, given = compiled_forward(world.generator), example_inputs(world)
     noisy, time, conditioning = given
     two = (noisy.repeat(2, 1, 1, 1), time.repeat(2), repeated(conditioning, 2))
     with torch.inference_mode():
@@ -190,7 +190,7 @@ def test_cuda_graphs_draw_the_same():
 
 def test_several_flow_steps_go_through_it_too(worlds):
     eager, quick = worlds
-    noisy, _, conditioning = example(eager)
+    noisy, _, conditioning = example_inputs(eager)
     with torch.inference_mode():
         one, other = (generate(world.generator, noisy, conditioning, 3) for world in worlds)
     assert (one - other).abs().max() < 3 * PARITY
@@ -201,8 +201,8 @@ def test_threads_that_draw_with_other_numbers_of_threads_do_not_disturb_one_anot
     import onnxruntime
 
     world = place(Controls.buttons(3))
-    given = example(world)
-    quick = through_onnx(world.generator, given)
+    given = example_inputs(world)
+    quick = onnx_forward(world.generator, given)
     counts = threading.local()
     monkeypatch.setattr(torch, "get_num_threads", lambda: counts.now)
     real = onnxruntime.InferenceSession

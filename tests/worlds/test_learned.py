@@ -209,7 +209,7 @@ def test_a_whole_step_stays_on_the_worlds_device(more):
 def test_a_state_of_another_memory_is_adopted_or_refused():
     world = place(KINDS["buttons"])
     state, still = walk(world, look=False), torch.zeros(2, 3, dtype=torch.int8)
-    twin, other = place(KINDS["buttons"]), place(KINDS["buttons"]).with_memory_of(0.3)
+    twin, other = place(KINDS["buttons"]), place(KINDS["buttons"]).with_memory_budget(0.3)
     seen = world.render(state, ("rgb", "places"))
     assert all(torch.equal(value, seen[name]) for name, value in twin.render(state, tuple(seen)).items())
     after = twin.imagine(state, still, make_rng(3))

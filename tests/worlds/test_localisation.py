@@ -11,7 +11,7 @@ from terrella.core import make_rng
 from terrella.space.estimator import Estimator, EstimatorConfig
 from terrella.space.keyframes import Keyframes
 from terrella.space.recognise import thumbnails
-from terrella.worlds.localisation import AWAY_M, arrive
+from terrella.worlds.localisation import AWAY_M, localise
 
 
 def test_two_pictures_arrive_each_in_its_own_place():
@@ -25,7 +25,7 @@ def test_two_pictures_arrive_each_in_its_own_place():
     known = painted(here, room_depth(here))
     noise = torch.randint(0, 256, known.shape, generator=make_rng(0), dtype=torch.uint8)
     small = thumbnails(memory.rgb)
-    seen = arrive(torch.cat([known, noise]), estimator, memory, small, memory.at(slice(0, 4)), CAMERA, 6)
+    seen = localise(torch.cat([known, noise]), estimator, memory, small, memory.at(slice(0, 4)), CAMERA, 6)
     assert seen.recognised.tolist() == [True, False] and seen.pose.shape == (2, 7) and seen.depth.shape == (2, *SIZE)
     assert float((seen.pose[0, :2] - here[0, :2]).norm()) < 0.25
     truth = room_depth(here)[0]
@@ -33,5 +33,5 @@ def test_two_pictures_arrive_each_in_its_own_place():
     assert torch.allclose(seen.depth[1], estimator.depth(noise)[0], rtol=1e-4)
     assert float(seen.pose[1, 0]) > float(pose[:, 0].max()) + AWAY_M - 10
     none = memory.at(slice(0, 0))
-    lost = arrive(known, estimator, none, thumbnails(none.rgb), memory.at(slice(0, 4)), CAMERA, 6)
+    lost = localise(known, estimator, none, thumbnails(none.rgb), memory.at(slice(0, 4)), CAMERA, 6)
     assert lost.recognised.tolist() == [False]

@@ -18,7 +18,7 @@ from terrella.space.occupancy import Walker
 from terrella.space.raster import rasterise
 from terrella.space.solids import Solids
 from terrella.worlds.splat import SolidBoxes, SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import other_of, read_edits, save_splat, source_of
+from terrella.worlds.splat_folder import load_source, merged_loader, read_edits, save_splat
 
 from ..space.test_raster import cloud
 
@@ -107,7 +107,7 @@ def test_it_is_undone_redone_and_edited_as_anything_else(two):
     merged, first = opened(path / "a"), (path / "a" / "world.edits.jsonl").read_bytes()
     assert len(merged.gaussians) == 60 + len(there.gaussians)
     view = dict.fromkeys(NAMES, "0") | {"x": "14", "wide": "1", "tall": "1", "width": "32", "height": "32"}
-    source, mine = source_of(path / "a"), other_of(path / "a")
+    source, mine = load_source(path / "a"), merged_loader(path / "a")
     with_it, without = (
         FrameRenderer(source.gaussians, source.objects, edits, mine) for edits in (lambda: read_edits(path / "a"), list)
     )
@@ -171,8 +171,8 @@ def test_what_cannot_be_merged(two, capsys):
     assert edit(path / "a", "--merge", str(path / "b")) == 2  # a within b within a
     assert "has it merged" in capsys.readouterr().err
     line = {"do": "merge", "place": 7, "by": [0, 0, 0], "degrees": 0}
-    source = source_of(path / "a")
+    source = load_source(path / "a")
     with pytest.raises(ContractError, match="names a `place`"):
-        apply_edits(source.gaussians, [line], source.objects, other_of(path / "a"))
+        apply_edits(source.gaussians, [line], source.objects, merged_loader(path / "a"))
     with pytest.raises(ContractError, match="needs the other place"):
         apply_edits(source.gaussians, [line])

@@ -21,9 +21,9 @@ from terrella.worlds.objects import (
     RESTED,
     Billboards,
     BillboardsConfig,
-    fresh,
-    likest,
-    noted,
+    nearest_look,
+    new_billboards,
+    update_billboards,
 )
 
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
@@ -61,7 +61,7 @@ def sure(objects: Billboards, look: int, move: int, gone: bool = False) -> Billb
 def billboards(objects: Billboards, *places: tuple[float, float, float]) -> torch.Tensor:
     whole = objects.empty(1)
     for row, place in enumerate(places):
-        whole[0, row] = fresh(row + 1, torch.tensor(place), RED)
+        whole[0, row] = new_billboards(row + 1, torch.tensor(place), RED)
     return whole
 
 
@@ -111,7 +111,7 @@ def test_what_was_painted_is_recognised_by_its_look_and_its_light():
     objects = two_looks()
     there = billboards(objects, (4.0, 1.0, 0.0), (5.0, -1.5, 0.0))
     there[0, 1, LOOK], there[0, 0, LIGHT] = BLUE, 0.5
-    found = objects.recognised(*shown(objects, there), objects.empty(1))
+    found = objects.match_evidence(*shown(objects, there), objects.empty(1))
     assert torch.equal(found[..., :5], there[..., :5]) and (found[0, 2:] == 0).all()
     assert 0.35 < found[0, 0, LIGHT] < 0.6 and 0.7 < found[0, 1, LIGHT] < 1.1
 
@@ -122,7 +122,7 @@ def test_a_billboard_keeps_its_own_past_and_what_is_not_told_of_waits():
     before[0, :2, NUMBER] = torch.tensor([7.0, 9.0])
     now = billboards(objects, (5.0, -1.25, 0.0))
     now[0, 0, NUMBER] = 9.0
-    found = objects.recognised(*shown(objects, now), before)
+    found = objects.match_evidence(*shown(objects, now), before)
     assert found[0, :, NUMBER].tolist() == [9, 7, 0, 0]
     assert found[0, 0, GOING].tolist() == [0.0, 0.25] and torch.equal(found[0, 1], before[0, 0])
 
@@ -161,11 +161,11 @@ def test_evidence_of_a_batch_is_taken_as_each_alone():
     rgb, depth, instances = objects.painted(now, *behind, pose, CAMERA)
     listed = now[..., :4]
     cut = cut_out((rgb * 255).to(torch.uint8), instances, depth, listed[..., PLACE], pose, CAMERA)
-    whole = objects.recognised(cut, listed, before)
+    whole = objects.match_evidence(cut, listed, before)
     for n in range(6):
         picked = slice(n, n + 1)
         parts = (rgb[picked] * 255).to(torch.uint8), instances[picked], depth[picked], listed[picked][..., PLACE]
-        alone = objects.recognised(cut_out(*parts, viewer(), CAMERA), listed[picked], before[picked])
+        alone = objects.match_evidence(cut_out(*parts, viewer(), CAMERA), listed[picked], before[picked])
         assert torch.allclose(alone[0], whole[n], atol=1e-4)
         kept = set(before[n, :, NUMBER].tolist()) | set(listed[n, :, 0].tolist())
         assert set(whole[n, :, NUMBER].tolist()) <= kept
@@ -181,8 +181,12 @@ def test_what_is_lit_more_than_its_picture_does_not_turn_dark():
 
 def test_a_look_lasts_unless_another_is_clearly_nearer():
     off = torch.tensor([0.30, 0.20, 2.0])
-    assert likest(off, NONE) == 1 and likest(off, 0) == 0 and likest(torch.tensor([0.5, 0.2, 2.0]), 0) == 1
-    assert likest(torch.tensor([0.9, 0.8, 2.0]), 0) == NONE
+    assert (
+        nearest_look(off, NONE) == 1
+        and nearest_look(off, 0) == 0
+        and nearest_look(torch.tensor([0.5, 0.2, 2.0]), 0) == 1
+    )
+    assert nearest_look(torch.tensor([0.9, 0.8, 2.0]), 0) == NONE
 
 
 def test_a_look_that_is_not_known_is_not_painted():
@@ -195,7 +199,7 @@ def test_a_look_that_is_not_known_is_not_painted():
 
 
 def test_ages_are_counted_to_a_limit():
-    one = fresh(1, torch.zeros(3), RED)[None]
+    one = new_billboards(1, torch.zeros(3), RED)[None]
     for _ in range(40):
-        one = noted(one, torch.zeros(1, 3), torch.tensor([float(RED)]))
+        one = update_billboards(one, torch.zeros(1, 3), torch.tensor([float(RED)]))
     assert one[0, AGE] == one[0, RESTED] == 24

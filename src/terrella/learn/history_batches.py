@@ -9,7 +9,7 @@ import torch
 
 from ..worlds.config import VideoConfig
 from ..worlds.controls import Controls
-from ..worlds.frame_history import past
+from ..worlds.frame_history import glimpse_of_frames
 from ..worlds.generator import Conditioning, context_thumbnail, encode_depth, pixels
 from .batches import Batch, Dream, encode_rgb
 from .recording import Recording
@@ -56,10 +56,10 @@ def history_batch(
     frames = rgb[index[:, None], shown]
     for rows in (target - dreamt + step for step in range(dreamt)):
         nothing = torch.zeros(batch, 4, *config.size)
-        conditioning = Conditioning(past(frames), nothing, _context(actions, rows, frames))
+        conditioning = Conditioning(glimpse_of_frames(frames), nothing, _context(actions, rows, frames))
         clean = dream(conditioning, now)  # pyright: ignore[reportOptionalCall]
         frames = torch.cat([pixels(clean)[:, None], frames[:, :-1]], 1)
-    glimpse, frame = past(frames), rgb[index, target]
+    glimpse, frame = glimpse_of_frames(frames), rgb[index, target]
     truth = torch.cat([encode_rgb(frame), encode_depth(glimpse.depth)[:, None]], 1)
     weight = change_weight(frame, torch.stack([frames[:, 0], rgb[index, target - 1]], 1))
     context = _context(actions, target, frames)

@@ -18,7 +18,7 @@ from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
 from ..space.reproject import least_around
-from ..worlds.carried_frames import covering, still
+from ..worlds.carried_frames import covered_pixels, static_depth
 from ..worlds.config import VideoConfig
 from ..worlds.controls import AXES, CHOICE, Controls
 from .trainer import Report
@@ -147,11 +147,11 @@ class Recording:
 
     def covered(self, rows) -> torch.Tensor:
         """bool [n, H, W], see worlds/carried_frames.covering."""
-        return covering(self.instances(rows), self.things(rows))
+        return covered_pixels(self.instances(rows), self.things(rows))
 
     def static_depth(self, rows) -> torch.Tensor:
         """The depth [n, H, W] for keyframes: 0 at moving things and right beside them, where compressed video bleeds."""
-        kept = still(self.depth(rows), self.things(rows))
+        kept = static_depth(self.depth(rows), self.things(rows))
         return torch.where(least_around(kept) > 0, kept, 0.0)
 
     def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:

@@ -10,7 +10,7 @@ from ..core.errors import CheckpointError, TerrellaError
 from ..library import folder_of
 from ..space.edits import ACTIONS, Edit, apply_edits
 from ..space.occupancy import extent
-from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merging, other_of, read_edits, write_edits
+from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merge_edit, merged_loader, read_edits, write_edits
 from .progress import Progress, silent
 from .splat_places import SpaceResult, open_splat
 
@@ -82,7 +82,7 @@ def edit_space(world: str, config: EditSpaceConfig, *, progress: Progress = sile
     else:
         opened = open_splat(world)
         new = undone[-1] if config.redo else _new_edit(folder, config)
-        apply_edits(opened.gaussians, [new], opened.objects, other_of(folder))  # raises if it cannot be done
+        apply_edits(opened.gaussians, [new], opened.objects, merged_loader(folder))  # raises if it cannot be done
         write_edits(folder, [*edits, new], undone[:-1] if config.redo else ())
     return _result(world, config, progress)
 
@@ -109,7 +109,7 @@ def _new_edit(folder: Path, config: EditSpaceConfig) -> Edit:
                 f"{config.merge} is a file; `terrella space import` or `space build` makes a world of it first."
             )
         open_splat(config.merge)
-        return merging(folder, folder_of(config.merge), config.move or (0.0, 0.0, 0.0), config.turn or 0.0)
+        return merge_edit(folder, folder_of(config.merge), config.move or (0.0, 0.0, 0.0), config.turn or 0.0)
     [(action, value)] = config.actions.items()
     parameter, _ = ACTIONS[action]
     edit = {"select": config.selection or {"all": True}, "do": action}

@@ -16,7 +16,15 @@ from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
-from ..worlds.splat_folder import checked_edits, merging, other_of, read_edits, source_of, world_of, write_edits
+from ..worlds.splat_folder import (
+    checked_edits,
+    load_source,
+    merge_edit,
+    merged_loader,
+    read_edits,
+    world_of,
+    write_edits,
+)
 
 
 @dataclass(frozen=True)
@@ -64,8 +72,8 @@ def page_scene(
 def unedited_scene(world: str) -> PlaceScene:
     """The content of the page of a world of Gaussians, before all edits."""
     open_splat(world)  # refuses other kinds of worlds
-    other = other_of(folder_of(world))
-    return page_scene(source_of(folder_of(world)), lambda edit: page_scene(other(edit), walked=False))
+    other = merged_loader(folder_of(world))
+    return page_scene(load_source(folder_of(world)), lambda edit: page_scene(other(edit), walked=False))
 
 
 def compared_scene(name: str) -> PlaceScene:
@@ -92,6 +100,6 @@ def editable_place(world: str, beside: str | None = None) -> EditablePlace:
 def _merge_of(folder: Path, other: str) -> Edit | None:
     """The edit that merges a world; None if one of the two contains the other."""
     try:
-        return merging(folder, folder_of(other))
+        return merge_edit(folder, folder_of(other))
     except ContractError:
         return None

@@ -41,8 +41,8 @@ class Motion(nn.Module):
         """heading [B] radians; speed [B, 2] metres a step, world frame; actions [B, history + 1, A], the newest last.
         Returns the new heading [B] and the displacement that this step wishes for [B, 2]."""
         heading = heading + 0.1 * self.turn(actions.flatten(1))[:, 0]
-        glide = self.glide(torch.cat([10 * turned(speed, -heading), actions[:, -1]], -1))
-        return heading, 0.1 * turned(glide, heading)
+        glide = self.glide(torch.cat([10 * rotate(speed, -heading), actions[:, -1]], -1))
+        return heading, 0.1 * rotate(glide, heading)
 
     def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Logit that the episode ends at `place` [B, 2]: [B]."""
@@ -85,7 +85,7 @@ class MotionBody:
         shift, speed = slide(walls.shared, pose[:, :2], wish, self.config.body_m, self.config.short, walls.own)
         place, height = pose[:, :2] + shift, pose[:, 2]
         if self.config.stairs and len(levels):
-            height = climbed(levels, pose[:, :2], place, height)
+            height = follow_stairs(levels, pose[:, :2], place, height)
         return {
             "pose": planar_pose(place[:, 0], place[:, 1], height, heading),
             "speed": speed,
@@ -114,7 +114,7 @@ class NoBody(Absent):
         return torch.zeros(len(action), dtype=torch.bool, device=action.device)
 
 
-def climbed(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
+def follow_stairs(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """The viewer's height [B] after a step from place `before` to `after` [B, 2], coming from `z` [B]: it rises as the recorded
     places around, `levels` [K, 3], do, as far as a step up or down leads there, and leans towards them as it walks."""
     reached = []
@@ -127,7 +127,7 @@ def climbed(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: 
     return z + (reached[1] - reached[0] + lean * (reached[1] - z)).clamp(-0.3, 0.3)
 
 
-def turned(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+def rotate(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """[B, 2] rotated counter-clockwise by [B] radians."""
     c, s = angle.cos(), angle.sin()
     return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)

@@ -26,14 +26,14 @@ class Frame(NamedTuple):
     covered: torch.Tensor
 
 
-def covering(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
+def covered_pixels(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and the `things` [B, H, W] around them,
     since the pixels of their rim are mixed."""
     bare = (instances == 0).float()
     return (bare == 0) | ((least_around(bare) == 0) & (things > 0.5))
 
 
-def still(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
+def static_depth(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] as a keyframe keeps it: 0 (unknown) where `things` are."""
     return torch.where(things > 0.5, 0.0, depth)
 

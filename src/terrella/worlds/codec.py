@@ -77,12 +77,12 @@ class Scroll(nn.Module):
         nn.init.zeros_(self.votes.weight)
         self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * config.moves))  # untrained, nothing scrolls
 
-    def glanced(self, frame: torch.Tensor) -> torch.Tensor:
+    def frame_features(self, frame: torch.Tensor) -> torch.Tensor:
         """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
         return self.glance(frame.float() / 127.5 - 1)
 
     def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
-        """Logits [B, moves + 1]. seen: features of `glanced`; went [B, slots - 1, moves + 1]: how well each move explained each
+        """Logits [B, moves + 1]. seen: of `frame_features`; went [B, slots - 1, moves + 1]: how well each move explained each
         frame by the one before, 0..1."""
         went = went / went.amax(2, keepdim=True).clamp_min(0.01)
         return self.votes(F.silu(self.known(torch.cat([seen, context, went.pow(4).flatten(1)], 1))))
@@ -146,7 +146,7 @@ class Codec(nn.Module):
             return conditioning
         frames, context = _frames(conditioning), conditioning.context
         went = [edge_shares(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
-        logits = self.scrolling(self.scrolling.glanced(frames[:, 0]), context, torch.stack(went, 1))
+        logits = self.scrolling(self.scrolling.frame_features(frames[:, 0]), context, torch.stack(went, 1))
         return replace(conditioning, scroll=least_off(logits, self.moves))
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:

@@ -48,7 +48,7 @@ class Choice:
 EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
 
 
-def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
+def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     """The world with the faster of two ways of drawing, and which it is: eager torch, or ONNX Runtime on a CPU and a compiled
     graph on a GPU. Frames that need a gradient are always drawn by eager torch.
 
@@ -59,15 +59,15 @@ def quickened(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
         raise TerrellaError(
             "--fast is for worlds that a U-Net draws; this one fetches its pixels by compiled kernels already."
         )
-    inputs = example(world)
+    inputs = example_inputs(world)
     on_cpu = world.device.type == "cpu"
     began = time.perf_counter()
     eager: Forward = generator.forward
-    other = through_onnx(generator, inputs) if on_cpu else compiled(generator)
+    other = onnx_forward(generator, inputs) if on_cpu else compiled_forward(generator)
     with torch.inference_mode():
         other(*inputs)
         prepared = time.perf_counter() - began
-        slow, quick = in_turns([lambda: eager(*inputs), lambda: other(*inputs)])
+        slow, quick = alternating_ms([lambda: eager(*inputs), lambda: other(*inputs)])
     wins = quick < slow
     if wins:
         vars(generator)["forward"] = _either(eager, other)
@@ -86,7 +86,7 @@ def _either(eager: Forward, quick: Forward) -> Forward:
     return forward
 
 
-def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioning]:
+def example_inputs(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioning]:
     """Inputs of the generator for a frame of one episode: noise, flow time and conditioning."""
     rng = make_rng(0)
     state = world.start(1, rng)
@@ -97,7 +97,7 @@ def example(world: LearnedWorld) -> tuple[torch.Tensor, torch.Tensor, Conditioni
     return noise, torch.zeros(1, device=world.device), conditioning
 
 
-def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
+def onnx_forward(generator: nn.Module, inputs: tuple) -> Forward:
     """The generator in ONNX Runtime on the CPU, for any batch, with torch's number of threads."""
     # torch writes graphs with onnx
     if missing := [package for package in ("onnxruntime", "onnx") if not find_spec(package)]:
@@ -128,7 +128,7 @@ def through_onnx(generator: nn.Module, inputs: tuple) -> Forward:
     return forward
 
 
-def compiled(generator: nn.Module) -> Forward:
+def compiled_forward(generator: nn.Module) -> Forward:
     """The generator under torch.compile for one batch size, with CUDA graphs on a GPU; other batches are drawn eagerly. The
     first frame waits for the compiler."""
     on_gpu = next(generator.parameters()).device.type == "cuda"
@@ -143,7 +143,7 @@ def compiled(generator: nn.Module) -> Forward:
     return forward
 
 
-def in_turns(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float]:
+def alternating_ms(ways: list[Callable[[], object]], turns: int = TURNS) -> list[float]:
     """Median milliseconds of each way, run alternately so that all meet the same load."""
     times: list[list[float]] = [[] for _ in ways]
     for _ in range(turns):

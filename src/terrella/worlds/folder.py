@@ -150,7 +150,7 @@ def load_world(
             f"{path} is damaged or incomplete ({first_line(error)}); copy or train it again."
         ) from error
     if memory_mb is not None:
-        world = world.with_memory_of(memory_mb)
+        world = world.with_memory_budget(memory_mb)
     world = world if memory else world.without_memory()
     return world if torch.device(device).type == "cpu" else world.to(device)
 
@@ -206,7 +206,7 @@ def _about(world: dict) -> About:
     )
 
 
-def with_kept(about: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def with_saved_keys(about: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """`about` of a recording's world, with the keys and names of the world in `folder`, if there is one: a player may have
     changed them."""
     kept = read_about(folder)["about"] if (folder / WORLD_FILE).exists() else {}

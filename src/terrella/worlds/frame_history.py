@@ -128,9 +128,9 @@ class FrameHistory:
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
         familiar = torch.zeros(state.batch, 2, device=self.device)
         if not self.config.moves:
-            return Conditioning(past(frames), last, context, familiar)
+            return Conditioning(glimpse_of_frames(frames), last, context, familiar)
         over = self.over.expand(len(frames), -1, -1)
-        return Conditioning(past(frames), last, context, familiar, self._joined(state), over)
+        return Conditioning(glimpse_of_frames(frames), last, context, familiar, self._joined(state), over)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
@@ -164,7 +164,7 @@ def _shown(mosaic: torch.Tensor) -> torch.Tensor:
     return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
 
 
-def past(frames: torch.Tensor) -> Glimpse:
+def glimpse_of_frames(frames: torch.Tensor) -> Glimpse:
     """The last frames (uint8 [B, slots, 3, H, W], the newest first) as a Glimpse."""
     batch, slots, _, height, width = frames.shape
     trust = TRUST ** torch.arange(slots, dtype=torch.float32, device=frames.device)

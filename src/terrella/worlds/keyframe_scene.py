@@ -23,10 +23,10 @@ from ..space.memory import RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import carry_unknown, fill_holes
-from .carried_frames import Frame, carry_frames, covering, still
+from .carried_frames import Frame, carry_frames, covered_pixels, static_depth
 from .config import KeyframesConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
-from .localisation import AWAY_M, arrive
+from .localisation import AWAY_M, localise
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
 SEEN: tuple[str, ...] = "rgb", "depth", "things", "pose", "instances"  # state entries of a frame
@@ -167,7 +167,7 @@ class KeyframeScene:
             lone = prior["gone"][:, 3] > 0 if "gone" in prior else None
             return {**observation, "pose": prior["pose"], "depth": estimator.depth(rgb)}, lone
         config = self.config
-        seen = arrive(rgb, estimator, self.recorded, self._small, self.starts, config.camera, config.sources)
+        seen = localise(rgb, estimator, self.recorded, self._small, self.starts, config.camera, config.sources)
         return {**observation, "pose": seen.pose, "depth": seen.depth}, ~seen.recognised
 
     def observe(self, prior: State | None, evidence: Evidence) -> State:
@@ -225,7 +225,7 @@ class KeyframeScene:
         frames = []
         for age in ("", "earlier_"):
             rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
-            frames.append(Frame(rgb, depth, things, at, covering(instances, things)))
+            frames.append(Frame(rgb, depth, things, at, covered_pixels(instances, things)))
         context = torch.cat([context, state["actions"].flatten(1)], 1)
         return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context, familiar)
 
@@ -265,7 +265,7 @@ class KeyframeScene:
 
     def _lasting(self, state: State) -> torch.Tensor:
         """The frame's depth as a keyframe keeps it."""
-        return still(state["depth"], state["things"]) if self.config.moving else state["depth"]
+        return static_depth(state["depth"], state["things"]) if self.config.moving else state["depth"]
 
 
 def _cell_codes(places: torch.Tensor) -> torch.Tensor:

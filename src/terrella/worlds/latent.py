@@ -124,7 +124,7 @@ class LatentWorld:
         after = {
             "window": torch.cat([window[:, 1:], latent[:, None]], 1),
             "actions": actions[:, 1:],
-            "reward": network.paid(outcome.reward),
+            "reward": network.expected_reward(outcome.reward),
             "done_probability": outcome.done.sigmoid(),
             "spread": state["spread"] + members.var(0, correction=0).mean(1),
         }

@@ -224,7 +224,7 @@ class LatentNetwork(nn.Module):
         logits = self.heads["outcome"](torch.cat([window.flatten(1), action, after], 1))
         return Outcomes(logits[:, :-1], logits[:, -1])
 
-    def paid(self, logits: torch.Tensor) -> torch.Tensor:
+    def expected_reward(self, logits: torch.Tensor) -> torch.Tensor:
         """The reward expected [B]."""
         return (logits.softmax(1) * self.rewards).sum(1)
 

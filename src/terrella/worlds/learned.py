@@ -33,7 +33,7 @@ from .localisation import NoEstimator
 from .objects import NoObjects
 from .outcome import ConstantConfig, ConstantOutcome
 from .parts import NOISE, Body, Evidence, Generator, Objects, Outcome, Scene, Uncertainty, newest_frame
-from .uncertainty import GONE, NoUncertainty, gone_on
+from .uncertainty import GONE, NoUncertainty, drift
 
 PATIENCE = 4096  # steps after which a frame is drawn though nobody reads it: what it waits for is kept in memory
 
@@ -150,7 +150,7 @@ class LearnedWorld:
         """The same world without keyframes of recordings; where episodes begin stays."""
         return self.with_memory(self.memory.at(slice(0, 0)))
 
-    def with_memory_of(self, budget_mb: float) -> LearnedWorld:
+    def with_memory_budget(self, budget_mb: float) -> LearnedWorld:
         """The same world with another budget in MiB for an episode's own memory; with 0 it holds the last frame alone."""
         return self.replaced(scene=self.scene.with_memory(budget_mb=budget_mb))
 
@@ -207,7 +207,7 @@ class LearnedWorld:
         state = self._observed(evidence, observation, prior)
         if not evidence.seen:
             assert prior is not None
-            state = state.replace(**self.objects.step(prior, state, seeds), gone=gone_on(prior, state, led=True))
+            state = state.replace(**self.objects.step(prior, state, seeds), gone=drift(prior, state, led=True))
             return self._draw(state, prior, seeds, torch.zeros_like(state["done"]))
         return state if evidence.lone is None else self._judged(state, evidence.lone, seeds)
 
@@ -217,7 +217,7 @@ class LearnedWorld:
         seeds = chance.seeds(state.batch, rng, self.device)
         state, after = self.move(self.scene.adopt(state), numbers)
         still, ends = state["done"], self.body.ends(after, numbers)
-        after = after.replace(**self.objects.step(state, after, seeds), gone=gone_on(state, after, led=False))
+        after = after.replace(**self.objects.step(state, after, seeds), gone=drift(state, after, led=False))
         after = self._draw(after, state, seeds, still)
         after = after.replace(**self.outcome.step(state, after, ends, numbers, seeds))
         at_hand = [name for name in after if name not in self._drawn_names and after[name] is not state[name]]

@@ -31,7 +31,7 @@ class Arrival:
     recognised: torch.Tensor  # bool [B]: of a place that memory holds
 
 
-def arrive(
+def localise(
     rgb: torch.Tensor,
     estimator: Estimator,
     memory: Keyframes,

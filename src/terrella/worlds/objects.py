@@ -134,7 +134,7 @@ class Billboards(nn.Module):
         instances = instances * named.gather(1, instances.flatten(1).long()).view(instances.shape)
         instances = F.adaptive_max_pool2d(instances[:, None].float(), depth.shape[-2:])[:, 0].to(torch.uint8)
         cut = cut_out(evidence.seen["rgb"], instances, depth, listed[..., 1:], evidence.pose, camera)
-        billboards = self.recognised(cut, listed, none if prior is None else prior["billboards_before"])
+        billboards = self.match_evidence(cut, listed, none if prior is None else prior["billboards_before"])
         return {"billboards": billboards, "billboards_before": billboards, "instances": instances}
 
     def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
@@ -162,7 +162,7 @@ class Billboards(nn.Module):
 
     # -- what happens -------------------------------------------------------------------------------------------------
 
-    def foresee(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
+    def next_logits(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
         """Of billboards [n, COLUMNS], seen from `pose` [n, 7] after the actions [n, history, A], the newest last."""
         apart, heading = billboards[:, PLACE] - pose[:, :3], yaw(pose)
         c, s = heading.cos(), heading.sin()
@@ -185,10 +185,10 @@ class Billboards(nn.Module):
         self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor
     ) -> torch.Tensor:
         """The billboards [B, K, COLUMNS] one step later, sampled by seeds [B] (core/chance.py). seen bool [B, K]: the others wait;
-        pose [B, 7] and acts [B, history, A] as for `foresee`."""
+        pose [B, 7] and acts [B, history, A] as for `next_logits`."""
         rows = billboards.shape[1]
         flat = billboards.flatten(0, 1)
-        logits = self.foresee(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
+        logits = self.next_logits(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
         likely = logits.look.softmax(1)
         likely = torch.where(likely < likely.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0, likely)
         drawn = [
@@ -196,7 +196,9 @@ class Billboards(nn.Module):
             for part, stream in ((likely, LOOKS), (logits.move.softmax(1), MOVES))
         ]
         gone = chance.uniform(seeds, (rows,), stream=GOES) < logits.gone.sigmoid().unflatten(0, (-1, rows))
-        after = noted(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float()).unflatten(0, (-1, rows))
+        after = update_billboards(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float()).unflatten(
+            0, (-1, rows)
+        )
         after = torch.where(gone[..., None], 0.0, after)
         return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
 
@@ -228,13 +230,13 @@ class Billboards(nn.Module):
         walls = torch.stack([torch.stack(side, -1) for side in sides], 1)
         return torch.where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
 
-    def recognised(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    def match_evidence(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
         """The billboards [B, K, COLUMNS] of evidence, in the rows of `listed` [B, K, 4] = number and place. Those `before`
         [B, K, COLUMNS] that it does not list wait where they were, in rows that are free."""
         batch, rows = listed.shape[:2]
         pictures = self.pictures.float() / 255
         off = before.new_full((batch, rows, self.config.looks), torch.inf)  # unseen: unlike any look
-        off[cut.view, cut.row] = torch.cdist(marks(cut.picture, cut.box), marks(pictures, self.boxes))
+        off[cut.view, cut.row] = torch.cdist(look_features(cut.picture, cut.box), look_features(pictures, self.boxes))
         bright, whole = before.new_zeros(batch, rows), torch.zeros(batch, rows, dtype=torch.bool, device=before.device)
         bright[cut.view, cut.row], whole[cut.view, cut.row] = brightness(cut.picture), cut.whole
         usual = brightness(pictures).clamp_min(1e-3)
@@ -243,11 +245,13 @@ class Billboards(nn.Module):
         known = same.any(2)
         old = before.gather(1, same.float().argmax(2)[..., None].expand(-1, -1, COLUMNS))
         was = torch.where(known, old[..., LOOK].long(), NONE)
-        look = torch.where(whole, likest(off, was), NONE)
+        look = torch.where(whole, nearest_look(off, was), NONE)
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
         # seen in part or unlike any look: as before, else the nearest look
         look, place = torch.where(look == NONE, guess, look), listed[..., 1:]
-        now = torch.where(known[..., None], noted(old, place, look.float()), fresh(number, place, look))
+        now = torch.where(
+            known[..., None], update_billboards(old, place, look.float()), new_billboards(number, place, look)
+        )
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
         lit = (look != NONE) & (~known | whole)
         now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)
@@ -290,7 +294,7 @@ def in_sight(state: State) -> torch.Tensor:
     return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 
-def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
+def nearest_look(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
     """The look [...] of a thing, from its distances `off` [..., looks] and its look before, `was` [...]: the same, unless another
     is clearly nearer; NONE where all are far."""
     least, best = off.min(-1)
@@ -299,7 +303,7 @@ def likest(off: torch.Tensor, was: torch.Tensor | int) -> torch.Tensor:
     return torch.where(least > ALIKE, NONE, torch.where(stays, before, best))
 
 
-def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
+def new_billboards(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor | int) -> torch.Tensor:
     """New billboards [..., COLUMNS]: number and look [...], place [..., 3]."""
     billboards = place.new_zeros(*place.shape[:-1], COLUMNS)
     billboards[..., NUMBER], billboards[..., PLACE], billboards[..., LOOK] = number, place, look
@@ -308,7 +312,7 @@ def fresh(number: torch.Tensor | float, place: torch.Tensor, look: torch.Tensor 
     return billboards
 
 
-def noted(billboards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
+def update_billboards(billboards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
     """Billboards [..., COLUMNS] one step later at place [..., 3] with look [...], their ages and last moves updated."""
     after = billboards.clone()
     move = place - billboards[..., PLACE]
@@ -327,7 +331,7 @@ def brightness(picture: torch.Tensor) -> torch.Tensor:
     return (picture[:, :3].mean(1) * cover).sum((1, 2)) / cover.sum((1, 2)).clamp_min(1e-3)
 
 
-def marks(picture: torch.Tensor, box: torch.Tensor) -> torch.Tensor:
+def look_features(picture: torch.Tensor, box: torch.Tensor) -> torch.Tensor:
     """What looks are compared by: pictures [n, 4, h, w], small and at one brightness, and their boxes [n, 4]: [n, D]."""
     cover = picture[:, 3:]
     colour = 0.3 * picture[:, :3] / brightness(picture).clamp_min(0.02)[:, None, None, None]

@@ -99,7 +99,7 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
             SolidBoxes.of(solids, bodies),
         )  # fmt: skip
         edits = read_edits(path) if edits is None else edits
-        return _after(world, edits, other_of(path)) if edits else world
+        return _after(world, edits, merged_loader(path)) if edits else world
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 
@@ -133,7 +133,7 @@ def _solids(
     return SolidBoxes(torch.cat(solids), torch.cat(bodies))
 
 
-def source_of(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld:
+def load_source(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld:
     """The world as it was before all edits; None: after its own."""
     try:
         about = json.loads((Path(path) / WORLD_FILE).read_text())
@@ -144,7 +144,7 @@ def source_of(path: str | Path, edits: Sequence[Edit] | None = ()) -> SplatWorld
     return load_splat(path, about, edits)
 
 
-def merging(path: Path, other: Path, by: Sequence[float] = (0, 0, 0), degrees: float = 0) -> Edit:
+def merge_edit(path: Path, other: Path, by: Sequence[float] = (0, 0, 0), degrees: float = 0) -> Edit:
     """The edit that merges the world in the folder `other`, with its present edits, into that in `path`: turned by `degrees` to
     the left about the vertical through its origin, then moved `by` metres. ContractError for a place in itself."""
     path, other = path.resolve(), other.resolve()
@@ -171,7 +171,7 @@ def _digest(path: Path) -> str:
     return whole.hexdigest()
 
 
-def other_of(path: str | Path) -> Callable[[Edit], SplatWorld]:
+def merged_loader(path: str | Path) -> Callable[[Edit], SplatWorld]:
     """A function that opens the world that a merge of the one in `path` names, each once. CheckpointError where it is gone or was
     changed."""
 
@@ -187,7 +187,7 @@ def other_of(path: str | Path) -> Callable[[Edit], SplatWorld]:
                 f"{folder}, which {path} has merged, {fault}; put it back as it was, or take the merge back "
                 f"(terrella space edit {path} --undo) and merge anew."
             )
-        return source_of(folder, None)
+        return load_source(folder, None)
 
     def other(edit: Edit) -> SplatWorld:
         place, sha256 = edit.get("place"), edit.get("sha256")
@@ -216,10 +216,10 @@ def parse_edits(text: str) -> list[Edit]:
 
 def checked_edits(path: Path, text: str) -> list[Edit]:
     """The edits in lines of JSON, tried on the world in `path` without its edits; ContractError where they do not fit it."""
-    source = source_of(path)
+    source = load_source(path)
     try:
         edits = parse_edits(text)
-        apply_edits(source.gaussians, edits, source.objects, other_of(path))
+        apply_edits(source.gaussians, edits, source.objects, merged_loader(path))
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
         raise ContractError(f"these are no edits ({error}); give the lines of a world.edits.jsonl.") from error
     return edits

@@ -26,7 +26,7 @@ from .parts import Absent, Channels
 # unknown place, and how strange that was (0..1).
 GONE = ("steps", "metres", "radians", "lone", "strange")
 SITUATION = len(GONE) - 1 + 2  # without the last, and with Conditioning.familiar
-CLUES = 15  # maps that `clues` gives
+INPUT_MAPS = 15  # maps that `input_maps` gives
 CELLS = 4  # side in pixels of a cell of those maps; errors are predicted in cells of twice that
 KNOTS = 17  # of the calibration
 
@@ -51,7 +51,7 @@ class UncertaintyNetwork(nn.Module):
         super().__init__()
         self.config = config
         first, second = config.channels
-        self.enter = nn.Conv2d(CLUES, first, 3, 2, 1)
+        self.enter = nn.Conv2d(INPUT_MAPS, first, 3, 2, 1)
         self.situate = nn.Sequential(nn.Linear(config.situation, 32), nn.SiLU(), nn.Linear(32, 2 * second))
         self.wide = nn.Conv2d(first, second, 3, 1, 1)
         self.wider = nn.Conv2d(second, second, 3, 1, 2, 2)
@@ -77,7 +77,7 @@ class UncertaintyNetwork(nn.Module):
         return Channels({"uncertainty": spaces.Box(0, 1, (), np.float32)}, {"uncertainty": unit})
 
     def forward(self, maps: torch.Tensor, situation: torch.Tensor) -> torch.Tensor:
-        """maps [B, CLUES, h, w] of `clues`; situation [B, S]. Returns the expected error of each cell, 0..1: [B, h/2, w/2]."""
+        """maps [B, INPUT_MAPS, h, w]; situation [B, S]. Returns the expected error of each cell, 0..1: [B, h/2, w/2]."""
         gain, shift = self.situate(situation)[:, :, None, None].chunk(2, 1)
         x = F.silu(self.wide(F.silu(self.enter(maps))) * (1 + gain) + shift)
         x = F.silu(x + self.wider(x))
@@ -88,7 +88,7 @@ class UncertaintyNetwork(nn.Module):
     ) -> torch.Tensor:
         """The calibrated mean absolute error of frames `clean` [B, 4, H, W] drawn from `conditioning`, intensity 0..1: [B]. In an
         episode that began with a picture unlike the recordings (`strange` [B], 0..1) at least that of invention."""
-        learned = self.calibrated(self(clues(conditioning, clean), situation).mean((1, 2)))
+        learned = self.calibrated(self(input_maps(conditioning, clean), situation).mean((1, 2)))
         return torch.maximum(learned, self.invents * strange)
 
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
@@ -125,7 +125,7 @@ class UncertaintyProbe(Absent):
         return torch.zeros_like(strange)
 
 
-def gone_on(before: State, after: State, led: bool) -> torch.Tensor:
+def drift(before: State, after: State, led: bool) -> torch.Tensor:
     """`gone` [B, len(GONE)] of `after`, one step further from evidence than `before`. led: whether its pose was observed."""
     gone = before["gone"]
     steps, way = gone[:, :1] + 1, gone[:, 1:3]
@@ -138,8 +138,8 @@ def gone_on(before: State, after: State, led: bool) -> torch.Tensor:
     return torch.cat([steps, way, gone[:, 3:]], 1)
 
 
-def clues(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
-    """Maps [B, CLUES, H / CELLS, W / CELLS] of a drawn frame and its sources."""
+def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
+    """Maps [B, INPUT_MAPS, H / CELLS, W / CELLS] of a drawn frame and its sources."""
     glimpse, last = conditioning.glimpse, conditioning.last
     drawn, merged = clean[:, :3].clamp(-1, 1), merge(glimpse) * 2 - 1
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)

@@ -15,7 +15,17 @@ from ...core.world import make_rng
 from ...data import ClipCache
 from ...space.billboards import cut_out
 from ...space.camera import Intrinsics, project
-from ...worlds.objects import LOOK, NONE, NUMBER, PLACE, Billboards, fresh, likest, marks, noted
+from ...worlds.objects import (
+    LOOK,
+    NONE,
+    NUMBER,
+    PLACE,
+    Billboards,
+    look_features,
+    nearest_look,
+    new_billboards,
+    update_billboards,
+)
 from ..feeds import RandomBatches
 from ..recording import INSTANCES, OBJECTS, Recording
 from ..trainer import CPU, Loss, Report, Run, Trainer, TrainStep, adamw, warmup_cosine
@@ -121,7 +131,7 @@ def _cut(cache: ClipCache, rgb, rows: np.ndarray, camera: Intrinsics, report: Re
         clear = cut.whole & (share >= LARGE)
         picture = (cut.picture[clear] * 255).round().clamp(0, 255).byte()
         frame = torch.from_numpy(some)[cut.view]
-        parts.append((frame, cut.row, marks(cut.picture, cut.box), cut.box, share, cut.whole, clear, picture))
+        parts.append((frame, cut.row, look_features(cut.picture, cut.box), cut.box, share, cut.whole, clear, picture))
         if first // chunk % 16 == 0:
             report(first / len(rows), 1.0, "cutting out objects")
     frame, row, marked, box, share, whole, clear, picture = map(torch.cat, zip(*parts))
@@ -158,7 +168,7 @@ def _classified(off: torch.Tensor, seen: Sightings, cache: ClipCache) -> np.ndar
             continue
         thing = episode[one], numbers[one]
         before, was = last.get(thing, (NONE, NONE))
-        look[one] = likest(off[one], was if seen.frame[one] - before <= FORGETS else NONE)
+        look[one] = nearest_look(off[one], was if seen.frame[one] - before <= FORGETS else NONE)
         if look[one] != NONE:
             last[thing] = seen.frame[one], look[one]
     return look
@@ -247,9 +257,11 @@ def _transitions(
             for number, slot in here.items():
                 old, look, place = were.get(number), looks[row, slot], things[row, slot, 1:]
                 if old is None:
-                    now[number] = fresh(number, place, look)
+                    now[number] = new_billboards(number, place, look)
                 else:
-                    now[number] = noted(old[None], place[None], torch.where(look == NONE, old[LOOK], look)[None])[0]
+                    now[number] = update_billboards(
+                        old[None], place[None], torch.where(look == NONE, old[LOOK], look)[None]
+                    )[0]
                 if number not in met and row < first + WAITS:
                     born = row > first and _open(now[number], row - 1, cache, camera)
                     met[number] = _Met(now[number].clone(), born)
@@ -344,7 +356,7 @@ class ObjectsObjective:
     def losses(self, batch: torch.Tensor, now: TrainStep) -> Iterator[Loss]:
         weight = 1 / len(self.often) / self.often[batch]
         billboards, pose, look, move, gone = (part[batch] for part in self.tokens[:5])
-        logits = self.objects.foresee(billboards, pose, self.actions[batch])
+        logits = self.objects.next_logits(billboards, pose, self.actions[batch])
         possible = (look != NONE) & self.objects.follows[billboards[:, LOOK].long() + 1, look.clamp_min(0)]
         error = F.cross_entropy(logits.look, look.clamp_min(0), reduction="none").where(possible, 0.0)
         error = error + F.cross_entropy(logits.move, move, reduction="none") * ~gone

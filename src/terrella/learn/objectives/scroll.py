@@ -75,7 +75,7 @@ class ScrollObjective:
 
     def losses(self, batch: ScrollClips, now: TrainStep) -> Iterator[Loss]:
         frames, context, explained = (part.to(now.device) for part in batch)
-        seen = self.scroll.glanced(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
+        seen = self.scroll.frame_features(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         ages, losses, right = self.slots - 1, [], []
         rolled_out = torch.from_numpy(now.rng.random(len(explained)) < ROLLED_OUT).to(now.device)[:, None]
         first = torch.where(rolled_out[..., None], one_hot_clearest(explained[:, :ages]), explained[:, :ages])

@@ -24,7 +24,7 @@ from ...core.files import replacing
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
-from ...worlds.uncertainty import CELLS, KNOTS, UncertaintyConfig, UncertaintyNetwork, UncertaintyProbe, clues
+from ...worlds.uncertainty import CELLS, KNOTS, UncertaintyConfig, UncertaintyNetwork, UncertaintyProbe, input_maps
 from ..feeds import RandomBatches
 from ..recording import Recording
 from ..run_folder import resume_file
@@ -40,7 +40,7 @@ _APART = 5  # every 5th episode is for calibration
 
 
 class DreamFrames(NamedTuple):
-    """N frames of rollouts: their clues [N, CLUES, h, w] (half precision) and situations [N, S], which are the inputs; their errors
+    """N frames of rollouts: their clues [N, INPUT_MAPS, h, w] (half precision) and situations [N, S], the inputs; their errors
     in cells [N, h / 2, w / 2] and in the mean [N]; the number of their episode [N], and the index of their arm in ARMS [N]."""
 
     clues: torch.Tensor
@@ -188,7 +188,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
     inputs: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def note(conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor) -> None:
-        inputs.append((clues(conditioning, clean).half().cpu(), situation.cpu()))
+        inputs.append((input_maps(conditioning, clean).half().cpu(), situation.cpu()))
 
     def evidence(rows: np.ndarray) -> Observation:
         seen = recording.evidence(world.config, rows)

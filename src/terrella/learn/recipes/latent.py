@@ -16,7 +16,7 @@ from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
 from ...data import Clips, ClipsConfig, Dataset
 from ...worlds.checkpoint import WORLD_FILE
-from ...worlds.folder import save_latent, with_kept
+from ...worlds.folder import save_latent, with_saved_keys
 from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
@@ -252,7 +252,7 @@ class _Training:
     def world(self, trainer: Trainer) -> LatentWorld:
         """The world as it now is, on the CPU; a copy."""
         recording, cache = self.recording, self.recording.cache
-        about = with_kept(cache.world, self.run.out / "world")
+        about = with_saved_keys(cache.world, self.run.out / "world")
         names = about.get("action_names") or cache.action_names
         named = about.get("dt_s", 1 / cache.fps), tuple(names), about.get("keys", {}), self._card(trainer)
         limits = {"idle": tuple(about.get("idle", ())), "max_episode_steps": about.get("max_episode_steps")}

@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from ...worlds.config import VideoConfig
-from ...worlds.folder import with_kept
+from ...worlds.folder import with_saved_keys
 from ...worlds.generator import UNet
 from ...worlds.learned import About, LearnedWorld
 from ...worlds.outcome import ConstantConfig, ConstantOutcome, FrameOutcome
@@ -83,7 +83,7 @@ class VideoParts:
     def about(self, trainer: Trainer, modules: Sequence[nn.Module], keyframes: int) -> About:
         """Name, controls, limits and card of the world; `modules` are those whose parameters the card counts."""
         recording, cache = self.recording, self.recording.cache
-        kept = with_kept(cache.world, self.run.out / "world")
+        kept = with_saved_keys(cache.world, self.run.out / "world")
         names = kept.get("action_names") or cache.action_names  # of a choice, the recording names each
         assert recording.controls is not None  # a recording without actions was refused
         return About(
