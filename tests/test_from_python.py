@@ -6,11 +6,12 @@ import re
 from pathlib import Path
 
 from terrella.workflows import practise
+from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule
 
 GUIDE = Path(__file__).parents[1] / "docs" / "from-python.md"
 SHORT = {
     '"gym:CarRacing-v3"': '"gym:tests.cli.tiny:TerrellaTiny-v0"',
-    "LearnConfig(minutes=30,": "LearnConfig(minutes=0.15, frames=300,",
+    "LearnConfig(minutes=30,": "LearnConfig(minutes=0.5, frames=300,",
     "frames=5000": "frames=600",
     "LatentTraining(steps=4000)": "LatentTraining(steps=2, batch=4, latent=4, rollout=2, leap=2, history=1, hidden=8)",
     "Practice(minutes=5)": "Practice(steps=2, batch=8, horizon=2, hidden=8)",
@@ -23,6 +24,8 @@ SHORT = {
 
 def test_the_guides_code_runs_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    shares = {RECORDING: 60.0, TRAINING: 1.0, SCORING: 1.0}  # recording ends with its frames, training with its steps
+    monkeypatch.setattr(LearnSchedule, "share_s", property(lambda schedule: shares))
     monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 4)
     monkeypatch.setattr(practise, "ROUNDS", 1)
     monkeypatch.setattr(practise, "TRIAL_EPISODES", 2)
