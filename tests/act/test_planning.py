@@ -206,6 +206,7 @@ def test_episodes_are_judged_from_unsolved_starts():
     mine = play(world, planner(world, "icem", cost), 12, PlaySettings(20, judge, SEEN, SEEN, 2))
     floor = play(world, Random(world.spec), 12, PlaySettings(20, judge, SEEN, SEEN, 12))
     assert all(episode.success for episode in mine.episodes) and mine.skipped == floor.skipped > 0
+    assert all(len(episode.actions) == episode.steps < 20 for episode in mine.episodes), "success ends an episode"
     assert sum(bool(episode.success) for episode in floor.episodes) < 9
     for one, other in zip(mine.episodes[:2], floor.episodes):
         assert torch.equal(one.seen[0]["observation"], other.seen[0]["observation"])

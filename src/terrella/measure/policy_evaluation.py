@@ -276,15 +276,11 @@ def table(evaluation: PolicyEvaluation) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of a table of the scores of each policy and of random actions, the best first."""
     say = percent if evaluation.what == SUCCESS else with_interval
     first = REAL if evaluation.dream is not None else DREAM
-    heads = [name for name in (REAL, DREAM, "gap", CONTROL) if any(name in row for row in evaluation.rows.values())]
     names = sorted(evaluation.rows, key=lambda name: -evaluation.rows[name][first].value)
     labels = {name: f"{name} (baseline)" if name not in evaluation.policies else name for name in names}
-    more = [
-        head
-        for head in (f"{REAL} {RETURN}", f"{DREAM} {RETURN}")
-        if any(head in row for row in evaluation.rows.values())
-    ]
-    lines = []
+    columns = {name for row in evaluation.rows.values() for name in row}
+    heads = [name for name in (REAL, DREAM, "gap", CONTROL) if name in columns]
+    more, lines = [head for head in (f"{REAL} {RETURN}", f"{DREAM} {RETURN}") if head in columns], []
     for name in names:
         row = evaluation.rows[name]
         cells = [(with_interval if head == "gap" else say)(row[head]) if head in row else "" for head in heads]
@@ -294,5 +290,4 @@ def table(evaluation: PolicyEvaluation) -> tuple[list[str], list[list[str]]]:
 
 def as_dict(evaluation: PolicyEvaluation) -> dict[str, Any]:
     """Plain data for JSON, the verdict first."""
-    plain = dataclasses.asdict(evaluation)
-    return {"verdict": verdict(evaluation), **plain}
+    return {"verdict": verdict(evaluation), **dataclasses.asdict(evaluation)}

@@ -5,21 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from html import escape
 
+from . import policy_evaluation as scores
 from .page_parts import COLOURS, QUIET, document, legend, section, table_of, words_and_interval
 from .plot import Line, line_chart, y_span
 from .plot_points import ScatterPoint, dot_plot, scatter
-from .policy_evaluation import (
-    CONTROL,
-    DREAM,
-    PERSISTENCE,
-    RANDOM,
-    REAL,
-    SUCCESS,
-    UNCERTAINTY,
-    PolicyEvaluation,
-    table,
-    verdict,
-)
+from .policy_evaluation import CONTROL, DREAM, PERSISTENCE, RANDOM, REAL, SUCCESS, UNCERTAINTY, PolicyEvaluation
 from .statistics import Band
 
 _REAL, _DREAM = COLOURS[1], COLOURS[0]
@@ -27,9 +17,9 @@ _REAL, _DREAM = COLOURS[1], COLOURS[0]
 
 def policy_evaluation_page(title: str, evaluation: PolicyEvaluation, facts: Mapping[str, object]) -> str:
     """A self-contained HTML page."""
-    lines = [line[:1].upper() + line[1:] for line in verdict(evaluation)]
-    heads, cells = table(evaluation)
-    scores = table_of(list(map(escape, heads)), [[words_and_interval(cell) for cell in line] for line in cells])
+    lines = [line[:1].upper() + line[1:] for line in scores.verdict(evaluation)]
+    heads, cells = scores.table(evaluation)
+    figures = table_of(list(map(escape, heads)), [[words_and_interval(cell) for cell in line] for line in cells])
     known = {name.replace("_", " "): value for name, value in facts.items() if value is not None}
     settings = "".join(f"<li>{escape(name)}: {escape(str(value))}</li>" for name, value in known.items())
     words = "".join(f"<li>{escape(line)}</li>" for line in lines[1:])
@@ -39,7 +29,7 @@ def policy_evaluation_page(title: str, evaluation: PolicyEvaluation, facts: Mapp
         section(
             f"The {evaluation.what} of each policy",
             "With 95% intervals; the best first.",
-            _dot_plot(evaluation) + scores,
+            _dot_plot(evaluation) + figures,
         ),
         section(
             "Where the dream is wrong",

@@ -121,10 +121,9 @@ def _turn_rates_by_regression(spec: Spec, clips: Sequence[Clip], actions: Sequen
     change = torch.cat([_angle(heading.diff()) for _, heading in posed]).double()
     played = features(np.concatenate([np.asarray(clip.action[:-1]) for clip, _ in posed]))
     still = torch.eye(played.shape[1], dtype=torch.float64) * 1e-3  # actions never played get 0
-    parts = torch.linalg.lstsq(
-        torch.cat([played, still]), torch.cat([change, torch.zeros(len(still)).double()])
-    ).solution
-    return features(np.stack([action.numpy() for action in actions])) @ parts
+    target = torch.cat([change, torch.zeros(len(still)).double()])
+    shares = torch.linalg.lstsq(torch.cat([played, still]), target).solution
+    return features(np.stack([action.numpy() for action in actions])) @ shares
 
 
 def _angle(turn: torch.Tensor) -> torch.Tensor:
