@@ -141,16 +141,16 @@ def hidden_imports(modules: dict[str, ast.Module]) -> list[str]:
 
 def optional_modules(modules: dict[str, ast.Module]) -> set[str]:
     """The modules that cannot be imported without an optional package, directly or through another module."""
-    known, optional, grew = set(modules), set(), True
-    while grew:
-        before = len(optional)
-        for m, tree in modules.items():
-            for node in [n for top in tree.body for n in (top.body if isinstance(top, ast.Try) else [top])]:
-                names = {a.name for a in node.names} if isinstance(node, ast.Import) else set()
-                names |= {node.module or ""} if isinstance(node, ast.ImportFrom) and not node.level else set()
-                if any(n.split(".")[0] in OPTIONAL for n in names) or optional & set(imported(m, tree, node, known)):
-                    optional.add(m)
-        grew = len(optional) > before
+    known, optional, arrows = set(modules), set(), {}
+    for m, tree in modules.items():
+        nodes = [n for top in tree.body for n in (top.body if isinstance(top, ast.Try) else [top])]
+        names = {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
+        names |= {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom) and not n.level}
+        arrows[m] = {t for n in nodes for t in imported(m, tree, n, known)}
+        if any(name.split(".")[0] in OPTIONAL for name in names):
+            optional.add(m)
+    while more := {m for m, targets in arrows.items() if targets & optional} - optional:
+        optional |= more
     return optional
 
 
