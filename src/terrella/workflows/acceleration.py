@@ -35,19 +35,13 @@ class AccelerationConfig:
     """A simulator of the same task to compare with (mujoco:NAME), with the same actions and control step."""
     agent: str | None = None
     """Folder of a policy that was trained in the world. With --reference, the share of its return is measured."""
-    reference: str | None = None
-    """Folder of a policy that was trained in the simulator --beside."""
-    batches: tuple[int, ...] = (1, 64, 1024, 4096)
-    """Batch sizes: episodes that are stepped at once."""
-    seconds: float = 1.0
-    """Seconds to time each batch size in each turn."""
-    turns: int = 3
-    """World and simulator are timed in turn this many times; the median counts."""
-    episodes: int = 50
-    """Episodes in the simulator of --agent, of --reference and of random actions."""
+    reference: str | None = None  # Folder of a policy that was trained in the simulator --beside.
+    batches: tuple[int, ...] = (1, 64, 1024, 4096)  # Batch sizes: episodes that are stepped at once.
+    seconds: float = 1.0  # Seconds to time each batch size in each turn.
+    turns: int = 3  # World and simulator are timed in turn this many times; the median counts.
+    episodes: int = 50  # Episodes in the simulator of --agent, of --reference and of random actions.
     device: Device = "auto"
-    seed: int = 0
-    """The same seed gives the same actions."""
+    seed: int = 0  # The same seed gives the same actions.
 
 
 @dataclass(frozen=True)
@@ -58,14 +52,11 @@ class AccelerationResult:
     beside: str | None
     control_step_s: float
     threads: int
-    energy: str
-    """How joules were measured."""
-    throughput: Mapping[str, tuple[Throughput, ...]]
-    """`world` and `beside` -> the median of each batch size."""
+    energy: str  # How joules were measured.
+    throughput: Mapping[str, tuple[Throughput, ...]]  # `world` and `beside` -> the median of each batch size.
     usable_horizon: Figure | None = None
     """Steps for which the world predicts the simulator better than standing still; None where it cannot be measured."""
-    return_retained: Figure | None = None
-    """Return of the agent above random actions, as a share of the reference's."""
+    return_retained: Figure | None = None  # Return of the agent above random actions, as a share of the reference's.
 
     def best(self, arm: str) -> Throughput:
         return max(self.throughput[arm], key=lambda one: one.aggregate)

@@ -20,14 +20,10 @@ FEWEST = 2  # plans of a round that a search can do with
 class CurvePoint:
     """The episodes of a planner with some compute."""
 
-    config: SearchConfig
-    """Its search."""
-    imagined: float
-    """Steps imagined per decision, the median."""
-    score: Figure
-    """Its success, or its return where success is not judged."""
-    played: PlayResult
-    """Its episodes."""
+    config: SearchConfig  # Its search.
+    imagined: float  # Steps imagined per decision, the median.
+    score: Figure  # Its success, or its return where success is not judged.
+    played: PlayResult  # Its episodes.
 
     @property
     def label(self) -> str:

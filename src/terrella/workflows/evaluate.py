@@ -34,10 +34,8 @@ class EvaluateConfig:
     real: str | None = None
     """The real environment, to compare the world with (gym:CartPole-v1); default: none, the world alone."""
     environment: EnvironmentConfig = EnvironmentConfig()
-    episodes: int = 50
-    """Episodes of each policy, in the world and in the real environment."""
-    steps: int | None = None
-    """Steps per episode at most; default: the environment's limit, or 200."""
+    episodes: int = 50  # Episodes of each policy, in the world and in the real environment.
+    steps: int | None = None  # Steps per episode at most; default: the environment's limit, or 200.
     # What counts as success, and the goal of the policy `plan`: a picture file, the state as numbers, or CHANNEL=VALUE. With
     # `reward` nothing counts as success, and policies are ranked by their return.
     goal: str = REWARD
@@ -45,23 +43,18 @@ class EvaluateConfig:
     """Distance at which the goal is reached: a share of the range of numbers, or of the full brightness of pictures."""
     success: str | None = None
     """Channel of both worlds that is above 0 when an episode has succeeded, instead of --within."""
-    out: Path | None = None
-    """Folder for the page and evaluate.json; default: evaluations/ and the world's name."""
+    out: Path | None = None  # Folder for the page and evaluate.json; default: evaluations/ and the world's name.
     device: Device = "auto"
-    seed: int = 0
-    """The same seed gives the same result."""
+    seed: int = 0  # The same seed gives the same result.
 
 
 @dataclass(frozen=True)
 class EvaluateResult:
     """The scores of policies in a world and in the real environment."""
 
-    scores: PolicyEvaluation
-    """Figures of each policy, and how far world and reality agree."""
-    settings: Mapping[str, Any]
-    """World, goal and episodes."""
-    names: Mapping[str, str]
-    """The short label of a policy in `scores` -> its name."""
+    scores: PolicyEvaluation  # Figures of each policy, and how far world and reality agree.
+    settings: Mapping[str, Any]  # World, goal and episodes.
+    names: Mapping[str, str]  # The short label of a policy in `scores` -> its name.
     page: Path
 
     def to_json(self) -> dict[str, Any]:
@@ -101,8 +94,7 @@ class _Study:
     """The worlds of `evaluate`, opened and checked."""
 
     pair: PairedEvaluation
-    spec: Spec
-    """Of the channels that both worlds render, which policies may see."""
+    spec: Spec  # Of the channels that both worlds render, which policies may see.
     cost: Cost | None
 
     def load(self, name: str) -> Policy:

@@ -41,14 +41,10 @@ _SHOWN = ("pose", "places")  # channels by which routes are planned, beside thos
 class PageAgents:
     """Makes the agents of a page."""
 
-    played: World
-    """The world on the page."""
-    learned: World | None = None
-    """The world to plan in, where that is another (--compare)."""
-    name: str = ""
-    """The agent's name; "" for the one that suits the world."""
-    budget_ms: float = 30.0
-    """Time per decision."""
+    played: World  # The world on the page.
+    learned: World | None = None  # The world to plan in, where that is another (--compare).
+    name: str = ""  # The agent's name; "" for the one that suits the world.
+    budget_ms: float = 30.0  # Time per decision.
 
     def agents(self) -> Agents:
         """The agents for the page. TerrellaError for a name that does not fit."""

@@ -29,12 +29,9 @@ _REACHABLE_M = 3.0  # a place can be walked to if a known place is this near
 class PlaceGoals:
     """The goals of episodes that walk to a place."""
 
-    views: torch.Tensor
-    """Poses [N, 7]: one for all episodes, or those of a recording, of which each episode draws one."""
-    apart_m: float
-    """A view that is drawn is at least this far from the start of its episode."""
-    within_m: float
-    """Distance at which a place is reached."""
+    views: torch.Tensor  # Poses [N, 7]: one for all episodes, or those of a recording, of which each episode draws one.
+    apart_m: float  # A view that is drawn is at least this far from the start of its episode.
+    within_m: float  # Distance at which a place is reached.
 
     def play(
         self,

@@ -27,28 +27,18 @@ from .results import jsonable
 class PlanResult:
     """How often planning reached the goal, beside acting at random from the same starts."""
 
-    lines: tuple[str, ...]
-    """Sentences for people, the verdict first."""
-    settings: Mapping[str, Any]
-    """World, goal, search and episodes, with their defaults filled in."""
-    planner: Mapping[str, Figure]
-    """success (where it is judged), return, steps, `ms a decision` and `steps imagined`."""
-    random: Mapping[str, Figure]
-    """The same of random actions; empty if it was stopped before."""
-    difference: Mapping[str, Figure]
-    """Success or return of the planner less that of random actions, start by start."""
-    curve: tuple[CurvePoint, ...]
-    """The planner with ever more compute."""
-    episodes: tuple[PlayedEpisode, ...]
-    """The planner's episodes."""
+    lines: tuple[str, ...]  # Sentences for people, the verdict first.
+    settings: Mapping[str, Any]  # World, goal, search and episodes, with their defaults filled in.
+    planner: Mapping[str, Figure]  # success (where it is judged), return, steps, `ms a decision` and `steps imagined`.
+    random: Mapping[str, Figure]  # The same of random actions; empty if it was stopped before.
+    difference: Mapping[str, Figure]  # Success or return of the planner less that of random actions, start by start.
+    curve: tuple[CurvePoint, ...]  # The planner with ever more compute.
+    episodes: tuple[PlayedEpisode, ...]  # The planner's episodes.
     divergence: Mapping[str, Sequence[float]]
     """channel -> distance of the dream from reality, by step of the filmed episode."""
-    page: Path
-    """All of it to look at."""
-    film: Path | None
-    """Dream and reality side by side; None where there are no pictures."""
-    stopped: bool = False
-    """Whether Ctrl-C ended it early."""
+    page: Path  # All of it to look at.
+    film: Path | None  # Dream and reality side by side; None where there are no pictures.
+    stopped: bool = False  # Whether Ctrl-C ended it early.
 
     def to_json(self) -> dict[str, Any]:
         arms = {name: _plain(getattr(self, name)) for name in ("planner", "random", "difference")}

@@ -64,20 +64,16 @@ class PlanConfig:
     """A policy whose plans the search also tries: a folder of `train goals`, or a policy name as for `terrella evaluate`."""
     agent: str | None = None
     """A policy that acts instead of the search: a folder, or a policy name as for `terrella evaluate`."""
-    real: str | None = None
-    """The environment to act in (gym:CartPole-v1); default: the world itself."""
+    real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
     environment: EnvironmentConfig = EnvironmentConfig()
-    episodes: int = 10
-    """Number of episodes."""
+    episodes: int = 10  # Number of episodes.
     steps: int | None = None
     """Steps per episode at most; default: the environment's limit, else 200, or 30 s to walk to a place."""
     curve: bool = True
     """Plan again with a half, a quarter, ... of --samples or --budget-ms, to see whether more compute helps."""
-    out: Path | None = None
-    """Folder for the page, the film and plan.json; default: plans/ and the world's name."""
+    out: Path | None = None  # Folder for the page, the film and plan.json; default: plans/ and the world's name.
     device: Device = "auto"
-    seed: int = 0
-    """The same seed gives the same result."""
+    seed: int = 0  # The same seed gives the same result.
 
 
 @dataclass(frozen=True)
@@ -85,12 +81,9 @@ class PlannedEpisodes:
     """What `plan` played."""
 
     planner: PlayResult
-    random: PlayResult | None = None
-    """Random actions from the same starts; None if it was stopped before."""
-    curve: tuple[CurvePoint, ...] = ()
-    """The planner with ever more compute."""
-    stopped: bool = False
-    """Whether Ctrl-C ended it early."""
+    random: PlayResult | None = None  # Random actions from the same starts; None if it was stopped before.
+    curve: tuple[CurvePoint, ...] = ()  # The planner with ever more compute.
+    stopped: bool = False  # Whether Ctrl-C ended it early.
 
 
 @dataclass(frozen=True)
@@ -98,12 +91,10 @@ class PlanStudy:
     """The worlds of `plan`, opened and checked."""
 
     config: PlanConfig
-    search: SearchConfig
-    """The search with its defaults filled in."""
+    search: SearchConfig  # The search with its defaults filled in.
     world: World
     real: World
-    goal: Mapping[str, torch.Tensor]
-    """channel -> value; {} for reward or places."""
+    goal: Mapping[str, torch.Tensor]  # channel -> value; {} for reward or places.
     criterion: SuccessCriterion
     steps: int
     progress: Progress

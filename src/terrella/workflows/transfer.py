@@ -46,8 +46,7 @@ class TransferConfig:
     real: str | None = None
     gap: Path | None = None
     """A TOML or JSON file of how the real robot differs at a gap of 1: parameters, delay, backlash, noise.CHANNEL."""
-    dial: float = 1.0
-    """The size of the gap, from 0 (none of the file) to 1 (all of it)."""
+    dial: float = 1.0  # The size of the gap, from 0 (none of the file) to 1 (all of it).
     randomise: Path | None = None
     """A TOML or JSON file of parameter ranges, for domain randomisation and for system identification."""
     # What policies are trained in, to compare: nominal (the simulator as it is), randomised and identified (with other
@@ -55,14 +54,11 @@ class TransferConfig:
     arms: tuple[str, ...] = ARMS
     # Numbers of real episodes that models are fitted to. Identification uses 10, or the largest number if 10 is not listed.
     real_episodes: tuple[int, ...] = (1, 5, 10, 50)
-    episodes: int = 300
-    """Real episodes in which each policy is tested."""
-    seeds: int = 3
-    """Number of repetitions, each with its own training and its own real episodes to learn from."""
+    episodes: int = 300  # Real episodes in which each policy is tested.
+    seeds: int = 3  # Number of repetitions, each with its own training and its own real episodes to learn from.
     practice: int = 120
     """PPO updates, of 6,144 steps each, to train the nominal policy, and as many again for each other arm."""
-    success: str = "success"
-    """An episode succeeds when this channel is above 0."""
+    success: str = "success"  # An episode succeeds when this channel is above 0.
     # Also test policies that read their goal off a camera picture. Their encoders are trained on the simulator, on randomised
     # looks, adversarially with unlabelled real pictures, or on labelled real pictures.
     camera: bool = False
@@ -72,22 +68,18 @@ class TransferConfig:
     """With --camera: a TOML or JSON file of the looks that are randomised. Default: that of the bundled pair."""
     out: Path | None = None
     """Folder for the page, the figures and the policies; default: transfers/ and the robot's name."""
-    workers: int = 1
-    """Number of seeds that run at once, each in its own process."""
-    seed: int = 0
-    """The same seed gives the same result."""
+    workers: int = 1  # Number of seeds that run at once, each in its own process.
+    seed: int = 0  # The same seed gives the same result.
 
 
 @dataclass(frozen=True)
 class TransferResult:
     """The successes of each arm on the real robot."""
 
-    scores: TransferScores
-    """Figures of each arm, and how much of the gap it recovers."""
+    scores: TransferScores  # Figures of each arm, and how much of the gap it recovers.
     experiment: TransferExperiment
     seeds: tuple[int, ...]
-    identified: tuple[Mapping[str, float], ...]
-    """Of each seed the parameters that were identified, and their error."""
+    identified: tuple[Mapping[str, float], ...]  # Of each seed the parameters that were identified, and their error.
     page: Path
 
     def to_json(self) -> dict[str, Any]:

@@ -26,34 +26,20 @@ _EXTENDABLE = ("arms", "real_episodes", "look", "looks", "look_hash")  # a later
 class TransferExperiment:
     """An experiment with its files and fingerprints; asked.json holds it. Files are paths, "" for none."""
 
-    sim: str
-    """The simulator to train in, mujoco:NAME."""
-    real: str
-    """The simulator that stands for reality, mujoco:NAME."""
-    gap: str
-    """File of how it differs at a gap of 1."""
-    dial: float
-    """The gap, from 0 to 1."""
-    randomise: str
-    """File of the parameters that domain randomisation varies."""
-    episodes: int
-    """Episodes in which each policy is tested."""
-    practice: int
-    """Updates of training of the nominal policy, and again of each other arm."""
-    real_episodes: tuple[int, ...]
-    """Numbers of real episodes that models are fitted to."""
-    success: str
-    """The channel that is above 0 where an episode has succeeded."""
-    arms: tuple[str, ...]
-    """Arms of the experiment."""
-    hash: str
-    """sha256 of the real robot and its gap."""
-    look: str = ""
-    """File of how the real robot looks different."""
-    looks: str = ""
-    """File of the looks that visual randomisation varies."""
-    look_hash: str = ""
-    """sha256 of both looks."""
+    sim: str  # The simulator to train in, mujoco:NAME.
+    real: str  # The simulator that stands for reality, mujoco:NAME.
+    gap: str  # File of how it differs at a gap of 1.
+    dial: float  # The gap, from 0 to 1.
+    randomise: str  # File of the parameters that domain randomisation varies.
+    episodes: int  # Episodes in which each policy is tested.
+    practice: int  # Updates of training of the nominal policy, and again of each other arm.
+    real_episodes: tuple[int, ...]  # Numbers of real episodes that models are fitted to.
+    success: str  # The channel that is above 0 where an episode has succeeded.
+    arms: tuple[str, ...]  # Arms of the experiment.
+    hash: str  # sha256 of the real robot and its gap.
+    look: str = ""  # File of how the real robot looks different.
+    looks: str = ""  # File of the looks that visual randomisation varies.
+    look_hash: str = ""  # sha256 of both looks.
     rounds: int = 2
     """Rounds in which a model's episodes are gathered, each by the policy that was trained in the model before."""
 

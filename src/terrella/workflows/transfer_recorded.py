@@ -39,14 +39,12 @@ CANDIDATES, MOMENTS = 256, 32  # actions that are tried at each of some moments 
 class RecordedTransferResult:
     """How well a simulator predicts a recording, as it is, as identified, and with a learned residual."""
 
-    settings: Mapping[str, Any]
-    """sim, real, and the numbers of episodes that were learned from and held out."""
+    settings: Mapping[str, Any]  # sim, real, and the numbers of episodes that were learned from and held out.
     open_loop: Mapping[str, Mapping[int, Figure]]
     """world -> horizon in steps -> error of qpos (rad, m) in held-out episodes."""
     action_error: Mapping[str, Figure]
     """world -> error of the action that best explains a recorded step, in shares of the range."""
-    file: Path
-    """transfer.json."""
+    file: Path  # transfer.json.
 
     def to_json(self) -> dict[str, Any]:
         open_loop = {
