@@ -215,7 +215,7 @@ def test_conflicts_are_told_in_a_sentence(serve_world, open_page):  # noqa: F811
     page.click("#keys-open")
     row(page, "forward").locator(".cap").first.click()
     page.keyboard.press("KeyA")
-    assert said(page) == "A was “left” and is “forward” now; the former has no key any more."
+    assert said(page) == "A was “left” and is now “forward”; “left” has no key any more."
     assert caps(page, "left") == [] and row(page, "left").locator(".add").text_content() == "set a key"
     row(page, "left").locator(".add").click()
     page.keyboard.press("KeyP")

@@ -173,7 +173,7 @@ def test_what_was_merged_is_on_the_page(tmp_path, opened):
     wish = 0.6 * torch.rand(200, 3, generator=torch.Generator().manual_seed(1)) - 0.3
     theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
     body = after.config.body
-    mine = torch.cat([after.collider.moved(points, wish, body), after.collider.floor(points, body)[:, None]], 1)
+    mine = torch.cat([after.collider.walk(points, wish, body), after.collider.floor(points, body)[:, None]], 1)
     assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
 
 
@@ -200,7 +200,7 @@ def test_bodies_move_as_they_do_in_python(tmp_path, opened):
     wish = 0.6 * torch.rand(300, 3, generator=rng) - 0.3
     for solid in (place.occupancy, Occupancy.of(apply_edits(place.gaussians, EDITS[:1]).gaussians)):
         theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
-        mine = torch.cat([solid.moved(points, wish, body), solid.floor(points, body)[:, None]], 1)
+        mine = torch.cat([solid.walk(points, wish, body), solid.floor(points, body)[:, None]], 1)
         assert ((theirs - mine).abs().amax(1) < 0.02).float().mean() > 0.97
         page.evaluate("edits => { terrella.editor.change(() => terrella.story.replay(edits)); }", EDITS[:1])
 
@@ -216,7 +216,7 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     points = torch.tensor([0.0, 0.0, 1.6]) + torch.tensor([4.0, 4.0, 0.6]) * torch.rand(300, 3, generator=rng)
     wish = torch.rand(300, 3, generator=rng) - 0.5
     theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
-    mine = torch.cat([walled.collider.moved(points, wish, body), walled.collider.floor(points, body)[:, None]], 1)
+    mine = torch.cat([walled.collider.walk(points, wish, body), walled.collider.floor(points, body)[:, None]], 1)
     assert ((theirs - mine).abs().amax(1) < 0.01).float().mean() > 0.98
 
 

@@ -66,6 +66,6 @@ def test_walls_stop_and_floors_carry():
     angle = torch.arange(16) * (torch.pi / 8)
     wish = 0.2 * torch.stack([angle.cos(), angle.sin(), torch.zeros(16)], 1)
     for _ in range(40):
-        here = place.moved(here, wish, body)
+        here = place.walk(here, wish, body)
     assert (here[:, :2] > 0.1).all() and (here[:, :2] < 3.9).all()  # nobody got out
     assert (here[:, :2] - 2).norm(dim=1).min() > 1.2  # and everybody got somewhere

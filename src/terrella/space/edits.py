@@ -115,12 +115,12 @@ def merged_boxes(boxes: torch.Tensor, edit: Edit) -> torch.Tensor | None:
 def _placed(some: Gaussians, edit: Edit) -> Gaussians:
     """The Gaussians of a merged place."""
     by, degrees = _numbers(edit.get("by"), 3, "by"), _numbers(edit.get("degrees"), 1, "degrees")
-    there = _turned(some, float(degrees), torch.zeros(3).double(), by.double())
-    if (there.means.abs() > FARTHEST_M).any(1).float().mean() > 0.001:
+    placed = _turned(some, float(degrees), torch.zeros(3).double(), by.double())
+    if (placed.means.abs() > FARTHEST_M).any(1).float().mean() > 0.001:
         raise ContractError(
             f"what is merged reaches farther than {FARTHEST_M / 1000:g} km; scale it first, or delete what lies far away."
         )
-    return there
+    return placed
 
 
 def select(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:

@@ -149,10 +149,10 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
     both = [(part.expand(batch, *part.shape), mine[rows] if len(mine) else mine.expand(batch, *mine.shape))
             for part, mine in ((shared.coarse, own.coarse), (shared.depth, own.depth), (shared.pose, own.pose))]  # fmt: skip
     coarse, depth, poses = (torch.cat(pair, 1) for pair in both)
-    there = cast_slowly(coarse.flatten(1, 2), pose, camera, half)[:, some, some].flatten(1)
+    depths = cast_slowly(coarse.flatten(1, 2), pose, camera, half)[:, some, some].flatten(1)
     beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
-    points = (there[..., None] * beams) @ rotation(pose).mT + pose[:, None, :3]
-    votes = vote_slowly(depth, poses, points, there, camera)
+    points = (depths[..., None] * beams) @ rotation(pose).mT + pose[:, None, :3]
+    votes = vote_slowly(depth, poses, points, depths, camera)
     numbers = torch.arange(len(shared), device=pose.device).expand(batch, -1)
     numbers = torch.cat([numbers, torch.where(rows > 0, len(shared) + rows, -1)], 1)
     picks = pick_slowly(votes * (numbers >= 0)[..., None], count)
@@ -219,7 +219,7 @@ def look(
 
 def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
     """The same as `look`, in plain tensor algebra, also for GPUs."""
-    batch, there, mine = len(pose), picks >= 0, picks >= len(shared)
+    batch, valid, mine = len(pose), picks >= 0, picks >= len(shared)
     if not picks.shape[1] or not len(shared) + len(own):
         nothing = pose.new_zeros(batch, slots, 3, *size)
         return Glimpse(nothing, nothing[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
@@ -239,20 +239,20 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
     patch = patches_slowly(key_depth, poses, camera, FINE)
     if len(shared):
         patch = torch.where(mine[..., None, None], patch, shared.fine[torch.where(mine, 0, picks.clamp_min(0))])
-    patch = patch * there[..., None, None]
+    patch = patch * valid[..., None, None]
     depth = cast_slowly(patch.flatten(1, 2), pose, camera, size)
     hit = depth < FAR_M
     depth = fill_holes(depth)
-    colours, trust = recall_slowly(rgb, key_depth, poses, there, depth, pose, camera, slots)
+    colours, trust = recall_slowly(rgb, key_depth, poses, valid, depth, pose, camera, slots)
     return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 
 
-def recall_slowly(rgb, depth, poses, there, seen, pose, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
+def recall_slowly(rgb, depth, poses, valid, seen, pose, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
     """Colours [B, slots, 3, H, W] and trust [B, slots, H, W] of the most trusted that keyframes (rgb [B, S, 3, h, w] in [0, 1],
-    depth [B, S, h, w], poses [B, S, 7], there [B, S]) know of the surfaces that lie `seen` [B, H, W] deep from `pose` [B, 7]."""
+    depth [B, S, h, w], poses [B, S, 7], valid [B, S]) know of the surfaces that lie `seen` [B, H, W] deep from `pose` [B, 7]."""
     colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera)
     likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
-    sure = torch.where(there[..., None, None], agreement * likeness**2, -1.0)
+    sure = torch.where(valid[..., None, None], agreement * likeness**2, -1.0)
     best, order = sure.topk(min(slots, sure.shape[1]), dim=1)
     shown = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]
     missing = slots - best.shape[1]

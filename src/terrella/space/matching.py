@@ -27,9 +27,9 @@ def gather_sources(frames: torch.Tensor, source: torch.Tensor, moves: torch.Tens
     are the newest frame displaced by `moves` int64 [M, 2], the others the older frames. Edge pixels are replicated."""
     height, width = frames.shape[-2:]
     slot = (source - len(moves) + 1).clamp_min(0)
-    moved = torch.where(slot > 0, 0, source)
-    x = (torch.arange(width, device=source.device) - moves[:, 0][moved]).clamp(0, width - 1)
-    y = (torch.arange(height, device=source.device)[:, None] - moves[:, 1][moved]).clamp(0, height - 1)
+    move = torch.where(slot > 0, 0, source)
+    x = (torch.arange(width, device=source.device) - moves[:, 0][move]).clamp(0, width - 1)
+    y = (torch.arange(height, device=source.device)[:, None] - moves[:, 1][move]).clamp(0, height - 1)
     place = ((slot * height + y) * width + x).flatten(1)
     flat = frames.transpose(1, 2).flatten(2)
     return flat.gather(2, place[:, None].expand(-1, 3, -1)).unflatten(2, (height, width))

@@ -24,7 +24,7 @@ from .patches import patch_count
 from .views import arrays, over_views
 
 EMPTY, RECORDED, OBSERVED, DREAMT = range(4)  # kinds of keyframes
-PAGE = 16  # a memory has room for a multiple of so many keyframes, if for as many
+PAGE = 16  # the capacity of a memory is a multiple of this, if it is larger
 _EVERY = 11  # every so-manyth coarse patch of a keyframe is a point that another may cover
 _ALIKE = 0.02  # views whose covered shares differ by less are covered equally well
 

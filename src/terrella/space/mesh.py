@@ -86,10 +86,10 @@ def _surface(field: torch.Tensor, known: torch.Tensor) -> tuple[torch.Tensor, to
     except ImportError as error:
         raise ContractError("meshes need scikit-image; pip install 'terrella[mesh]'.") from error
     try:
-        found = marching_cubes(field.numpy(), 0.0, gradient_direction="descent", mask=known.numpy())
+        surface = marching_cubes(field.numpy(), 0.0, gradient_direction="descent", mask=known.numpy())
     except (ValueError, RuntimeError) as error:
         raise ContractError(f"no surface is seen in this place ({error}); give it another start.") from error
-    return torch.from_numpy(found[0].copy()).float(), torch.from_numpy(found[1].copy()).long()
+    return torch.from_numpy(surface[0].copy()).float(), torch.from_numpy(surface[1].copy()).long()
 
 
 def collider_mesh(collider: Solids | Occupancy) -> Mesh:

@@ -86,11 +86,11 @@ class RigidBodies:
         if not len(some):
             return poses, speeds, goal
         after, fast, came = self._stepped(poses[some], speeds[some], eye[some], goal[some])
-        sound = after.isfinite().all(2).all(1) & fast.isfinite().all(2).all(1) & came.isfinite().all(1)
+        finite = after.isfinite().all(2).all(1) & fast.isfinite().all(2).all(1) & came.isfinite().all(1)
         quiet = ~touched[some] & (fast.abs() < REST).all(2).all(1)
-        fast = torch.where((sound & ~quiet)[:, None, None], fast, 0.0)
-        after = torch.where(sound[:, None, None], after, poses[some])
-        came = torch.where((sound & touched[some])[:, None], came, goal[some])
+        fast = torch.where((finite & ~quiet)[:, None, None], fast, 0.0)
+        after = torch.where(finite[:, None, None], after, poses[some])
+        came = torch.where((finite & touched[some])[:, None], came, goal[some])
         return poses.index_copy(0, some, after), speeds.index_copy(0, some, fast), goal.index_copy(0, some, came)
 
     def _stepped(self, poses, speeds, eye, goal) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -100,7 +100,7 @@ class Occupancy:
         middle = level.nanmedian(1, keepdim=True).values
         return torch.where((level - middle).abs() < self.cell_m, level, torch.nan).nanmean(1)
 
-    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
+    def walk(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
         """Where walkers at `place` [B, 3] end up that try to move by `wish` [B, 3], sliding along walls: [B, 3]. Those that
         overlap a solid cell may leave it."""
         stuck = self.blocked(place, body)

@@ -31,9 +31,9 @@ def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride:
     images, turns, positions = arrays(
         depth.float().reshape(-1, height, width), rotation(pose).reshape(-1, 3, 3), pose[..., :3].reshape(-1, 3)
     )
-    found = torch.empty(len(images), patch_count((height, width), stride), 9)
-    each_view(lift, [images, turns, positions, found.numpy()], camera, stride, SLANT)
-    return found.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
+    made = torch.empty(len(images), patch_count((height, width), stride), 9)
+    each_view(lift, [images, turns, positions, made.numpy()], camera, stride, SLANT)
+    return made.view(*depth.shape[:-2], patch_count((height, width), stride), 9)
 
 
 def patch_count(size: tuple[int, int], stride: int) -> int:

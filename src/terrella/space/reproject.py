@@ -138,9 +138,9 @@ def carry_things(
     source, target = (rotation(pose), pose), (rotation(target_pose), target_pose)
     flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
     each_view(splat, arrays(depth, things, *source, *target, flat, canvas), camera)
-    found = torch.zeros(len(rgb), 6, *depth.shape[1:])
-    each_view(fetch, arrays(rgb, flat, things, covered, *source, _closed(canvas), *target, found), camera)
-    return found
+    carried = torch.zeros(len(rgb), 6, *depth.shape[1:])
+    each_view(fetch, arrays(rgb, flat, things, covered, *source, _closed(canvas), *target, carried), camera)
+    return carried
 
 
 def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) -> torch.Tensor:
@@ -152,11 +152,11 @@ def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) 
     where, ahead = project(unproject(seen, target_pose, camera).flatten(1, 2), pose, camera)
     grid, ahead = (where * 2 - 1).view(-1, height, width, 2), ahead.view(-1, height, width)
     planes = torch.cat([rgb.float() / 255, torch.stack([things, flat, covered.float()], 1)], 1)
-    found = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
-    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (found[:, 5] < 0.5)
-    trust = _agreement(found[:, 4], ahead, inside)[:, None]
-    found = found * (trust > 0)
-    return torch.cat([found[:, :3], trust, seen[:, None], found[:, 3:4]], 1)
+    carried = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
+    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (carried[:, 5] < 0.5)
+    trust = _agreement(carried[:, 4], ahead, inside)[:, None]
+    carried = carried * (trust > 0)
+    return torch.cat([carried[:, :3], trust, seen[:, None], carried[:, 3:4]], 1)
 
 
 def _closed(depth: torch.Tensor) -> torch.Tensor:
@@ -169,9 +169,9 @@ def _closed(depth: torch.Tensor) -> torch.Tensor:
 def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] with that of things averaged over their surroundings: a figure whose pixels lie at depths of their own
     would fall to pieces."""
-    there = (things > 0.5).float()
-    summed = F.avg_pool2d(torch.stack([depth * there, there], 1), 9, 1, 4)
-    return torch.where(there > 0, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
+    thing = (things > 0.5).float()
+    summed = F.avg_pool2d(torch.stack([depth * thing, thing], 1), 9, 1, 4)
+    return torch.where(thing > 0, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
 
 
 def _kernels_do(rgb: torch.Tensor, *others: torch.Tensor) -> bool:

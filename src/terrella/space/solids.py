@@ -53,7 +53,7 @@ class Solids:
         top = self.highest(place, body)
         return torch.where(top > -torch.inf, top, torch.nan)
 
-    def moved(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
+    def walk(self, place: torch.Tensor, wish: torch.Tensor, body: Walker) -> torch.Tensor:
         """Where walkers at `place` [B, 3] end up that try to move by `wish` [B, 3], sliding along walls: [B, 3]. Those that
         overlap a box may only move towards less penetration."""
         return slide(lambda at: self.depth(at, body), place, wish)

@@ -234,12 +234,12 @@ class SplatWorld:
     def _gone(self, state: State, level: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Where a body that wants to go by `level` [B, 3] metres arrives, and the things that it pushes on the way."""
         eye, body = state["pose"][:, :3], self.config.body
-        goal = self.collider.moved(eye, level, body)
+        goal = self.collider.walk(eye, level, body)
         if not self.things:
             return goal, {}
         poses, speeds, came = self.rigid.step(state["bodies"], state["body_speeds"], eye, goal)
         held = (came != goal).any(1, keepdim=True)  # things push back, but never into a wall
-        place = torch.where(held, self.collider.moved(eye, came - eye, body), goal)
+        place = torch.where(held, self.collider.walk(eye, came - eye, body), goal)
         return place, {"bodies": poses, "body_speeds": speeds}
 
     def _floor(self, state: Mapping[str, torch.Tensor], place: torch.Tensor) -> torch.Tensor:

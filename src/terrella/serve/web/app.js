@@ -1,4 +1,4 @@
-// The page: the picture, what it says about itself, and the buttons.
+// The page of a world: the picture, its figures, and the buttons.
 
 import { drawCard } from './card.js';
 import { Controls } from './controls.js';
@@ -166,7 +166,7 @@ function build() {
   $('sync').hidden = worlds.length < 2;
   able($('rewind'), past.why, 'Hold to rewind (Backspace)');
   able($('record'), noRecord, 'Record to a dataset');
-  able($('sync'), '', 'Set the dream to what the game shows now');
+  able($('sync'), '', 'Set the dream to the current state of the game');
   $('keys-open').hidden = !worlds[0].actions.length;
   hint();
   screens.layout();
@@ -180,7 +180,7 @@ function drawKeys() {
 
 function able(button, why, title) {
   button.setAttribute('aria-disabled', !!why);
-  button.title = why ? `${title}: not here, ${why}` : title;
+  button.title = why ? `${title}: not available, ${why}` : title;
 }
 
 function hint() {
@@ -238,7 +238,7 @@ function drawFigures() {
   if (past.dirty) past.draw();
 }
 
-// -- verbs ----------------------------------------------------------------------------------------------------------
+// -- commands -------------------------------------------------------------------------------------------------------
 
 function togglePause() {
   link.send({ type: status.paused || status.rewound ? 'resume' : 'pause' });
@@ -306,7 +306,7 @@ const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(
 /** What the page itself does with a key, here and now; '' where it does nothing. */
 function pageUse(code) {
   const uses = {
-    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints what is invented', KeyG: driver.there && 'lets the agent drive', KeyV: futures.there && 'shows what the agent considers', KeyB: goal.pictures && 'remembers the goal',
+    KeyM: !$('map-open').hidden && 'shows the map', KeyT: !$('tint').hidden && 'tints invented pixels', KeyG: driver.there && 'lets the agent drive', KeyV: futures.there && 'shows the futures that the agent considers', KeyB: goal.pictures && 'remembers the goal',
     KeyC: screens.cameras.length > 1 && 'changes the camera', KeyP: 'pauses', KeyR: 'restarts', KeyF: 'fills the screen', Enter: 'goes on from the past',
   };
   return uses[code] || '';
@@ -391,7 +391,7 @@ window.terrella = Object.freeze({
   get seed() { return status.seed; },
   get axes() { return [...controls.axes.values]; },
   get driving() { return !!status.driving; },
-  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count, goal: goal.at, goalPicture: !!goal.shown, goalWords: goal.told }; },
+  get agent() { return { name: driver.name, said: driver.said, held: [...driver.held], futures: futures.count, goal: goal.at, goalPicture: !!goal.shown, goalWords: goal.instruction }; },
   get uncertainty() { return uncertainty.value; },
   get uncertaintyLevel() { return uncertainty.level; },
   get map() { return views.figures; },

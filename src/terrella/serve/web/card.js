@@ -1,4 +1,4 @@
-// What is known about the worlds: their cards as lists of facts.
+// The cards of the worlds as lists of facts.
 
 /** A fact for people: few digits, no braces. */
 function say(value) {

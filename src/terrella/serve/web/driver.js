@@ -32,7 +32,7 @@ export class DriverView {
     $('drive').setAttribute('aria-pressed', driving);
     $('drive').title = driving ? 'Drive yourself (G, or any key of the world)' : `Let the agent drive${name ? `: ${name}` : ''} (G)`;
     if (driving) {
-      $('driver-name').textContent = name ? `${name[0].toUpperCase()}${name.slice(1)} drives` : 'The agent is getting ready';
+      $('driver-name').textContent = name ? `${name[0].toUpperCase()}${name.slice(1)} drives` : 'The agent is starting';
       const facts = [away !== null && `${away}${unit ? ` ${unit}` : ''} to go`, ms >= 5 && `thinks ${ms < 1000 ? `${ms} ms` : `${ms / 1000} s`}`].filter(Boolean);
       $('driver-more').textContent = [...facts, $('app').classList.contains('touchable') ? 'touch to take over' : 'any key takes over'].join(' · ');
     } else if (handed) {

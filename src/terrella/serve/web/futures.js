@@ -1,4 +1,4 @@
-// What the agent considers: a strip of small pictures for each plan, the chosen one first, the others as ghosts.
+// The futures that the agent considers: a strip of small pictures for each plan, the chosen one first, the others faded.
 
 const $ = (id) => document.getElementById(id);
 const NAMES = { 1: ['chosen'], 2: ['chosen', 'worst'], 3: ['chosen', 'middling', 'worst'] };
@@ -46,8 +46,8 @@ export class Futures {
 
   tell() {
     const { driving, considers, name } = this, waits = driving && considers && !this.list.childElementCount;
-    $('futures-said').textContent = !driving ? 'What the agent considers is drawn here while it drives.'
-      : waits ? 'Imagining what it considers …' : considers ? '' : `${name ? name[0].toUpperCase() + name.slice(1) : 'The agent'} does not plan: it considers no futures.`;
+    $('futures-said').textContent = !driving ? 'The futures that the agent considers appear here while it drives.'
+      : waits ? 'Imagining futures …' : considers ? '' : `${name ? name[0].toUpperCase() + name.slice(1) : 'The agent'} does not plan, so it considers no futures.`;
   }
 
   /** An event `futures` (see serve/protocol.py). */

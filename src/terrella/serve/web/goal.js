@@ -1,4 +1,4 @@
-// What the agent is to reach: a place that is clicked on the map, a picture that is remembered or dropped, or an instruction.
+// The agent's goal: a place clicked on the map, a picture that was saved or dropped, or an instruction.
 
 const $ = (id) => document.getElementById(id);
 const FORGET_M = 0.6;  // a click so near to the goal takes it away
@@ -6,7 +6,7 @@ const FORGET_M = 0.6;  // a click so near to the goal takes it away
 export class Goal {
   /** send(message); map: the map of places (map.js); say(sentence); quiet() lets go of all controls; go(): play goes on. */
   constructor(hooks) {
-    Object.assign(this, hooks, { places: false, pictures: false, words: false, at: null, shown: '', told: '' });
+    Object.assign(this, hooks, { places: false, pictures: false, words: false, at: null, shown: '', instruction: '' });
     $('goal-keep').onclick = () => { this.keep(); $('goal-keep').blur(); };
     $('goal-forget').onclick = () => this.send({ type: 'goal' });
     this.map.canvas.addEventListener('click', (event) => this.click(event));
@@ -29,7 +29,7 @@ export class Goal {
   keep() {
     if (!this.pictures) return;
     this.send({ type: 'goal', here: true });
-    this.say('Remembered as the goal: go elsewhere, and let the agent drive (G) to come back.');
+    this.say('This is the goal now: go elsewhere, and let the agent drive (G) to come back.');
   }
 
   /** An instruction is the goal. */
@@ -52,11 +52,11 @@ export class Goal {
   /** An event `goal` (see serve/protocol.py). */
   async show({ at, image, words }) {
     this.at = at;
-    this.told = words ?? '';
+    this.instruction = words ?? '';
     this.map.goal = at;
     this.map.draw();
     $('goal').classList.toggle('show', !!image);
-    $('goal').classList.toggle('told', !!words);
+    $('goal').classList.toggle('instructed', !!words);
     if (document.activeElement !== $('words')) $('words').value = words ?? '';
     this.shown = image ?? '';
     if (!image) return;

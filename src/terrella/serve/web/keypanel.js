@@ -1,4 +1,4 @@
-// The panel of keys: what each key does, changed by a click and a press, and kept where it says.
+// The panel of keys: what each key does, changed by a click and a key press.
 
 import { keyLabel } from './keycaps.js';
 
@@ -42,7 +42,7 @@ export class KeyPanel {
     if (open) { this.say(''); this.draw(); }
   }
 
-  // -- what is kept ---------------------------------------------------------------------------------------------------
+  // -- storage -----------------------------------------------------------------------------------------------------
 
   /** Takes a world as the server tells it, and what this browser keeps of it; says whether that is something to tell the server. */
   take(world) {
@@ -104,7 +104,7 @@ export class KeyPanel {
   restore() {
     this.asServed();
     this.asked = null;
-    this.use('Keys and names are as they were.');
+    this.use('Keys and names are reset.');
   }
 
   // -- asking for a key -------------------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ export class KeyPanel {
   /** Waits for a key: instead of `code`, or as one more for the action at `place`. null: waits no more. */
   ask(code, place = this.world?.keys[code]) {
     this.asked = place === undefined || place === null ? null : { code, place, pressed: [] };
-    if (this.asked) { this.quiet(); this.say('Press the key. Backspace takes it away, Escape leaves it as it is.'); } else this.say('');
+    if (this.asked) { this.quiet(); this.say('Press the key. Backspace removes it, Escape cancels.'); } else this.say('');
     this.draw();
     this.list.querySelector('.asking')?.scrollIntoView({ block: 'nearest' });
   }
@@ -124,7 +124,7 @@ export class KeyPanel {
     if (event.repeat) return;
     if (event.code === 'Escape') return this.ask(null);
     if (event.code === 'Backspace') return this.drop();
-    if (!event.code || BROWSERS.test(event.code)) return this.say('Ctrl, Alt and the like belong to the browser; press another key.');
+    if (!event.code || BROWSERS.test(event.code)) return this.say('Ctrl, Alt and similar keys belong to the browser; press another key.');
     this.asked.pressed.push(event.code);
     if (this.world.resting === null || this.asked.pressed.length > 3) this.bind();  // keys of buttons add up by themselves
   }
@@ -154,9 +154,9 @@ export class KeyPanel {
     const label = keyLabel(code), use = this.pageUse(code);
     if (other !== undefined) {
       const bare = !Object.values(this.world.keys).includes(other);
-      return `${label} was “${this.words(other)}” and is “${meant}” now${bare ? '; the former has no key any more' : ''}.`;
+      return `${label} was “${this.words(other)}” and is now “${meant}”${bare ? '; “' + this.words(other) + '” has no key any more' : ''}.`;
     }
-    return use ? `${label} also ${use} on this page: that is left to its button, as the world’s keys come first.` : '';
+    return use ? `${label} also ${use} on this page. The world’s keys come first; use the button for that.` : '';
   }
 
   drop() {
@@ -164,7 +164,7 @@ export class KeyPanel {
     this.asked = null;
     if (!code) return this.ask(null);
     this.world.keys = rebound(this.world.keys, code, null, place);
-    this.use(Object.values(this.world.keys).includes(place) ? '' : `“${this.words(place)}” has no key now.`);
+    this.use(Object.values(this.world.keys).includes(place) ? '' : `“${this.words(place)}” has no key.`);
   }
 
   /** Names an action, and what else has that name: the other end of an axis. */
@@ -185,11 +185,11 @@ export class KeyPanel {
     this.use();
   }
 
-  // -- what is seen -----------------------------------------------------------------------------------------------------
+  // -- display -------------------------------------------------------------------------------------------------------
 
   say(sentence) {
     const clashes = this.world ? Object.keys(this.world.keys).filter((code) => this.pageUse(code)) : [];
-    const standing = clashes.length ? `${clashes.map(keyLabel).join(', ')}: the world’s keys come first; for what the page does with ${clashes.length > 1 ? 'them' : 'it'} there are buttons.` : '';
+    const standing = clashes.length ? `${clashes.map(keyLabel).join(', ')}: the world’s keys come first; use the page’s buttons instead of ${clashes.length > 1 ? 'these keys' : 'this key'}.` : '';
     this.said.textContent = sentence || standing;
     this.said.classList.toggle('warn', !!sentence && !sentence.startsWith('Press'));
   }

@@ -6,7 +6,7 @@ export const DONE = 1, FRESH = 2, REPLAY = 4;
 /** A frame message (see serve/protocol.py) as its numbers and its JPEG bytes. */
 export function readFrame(buffer) {
   const view = new DataView(buffer);
-  if (view.getUint8(0) !== VERSION) throw new Error('this page is of another version than the server: reload it');
+  if (view.getUint8(0) !== VERSION) throw new Error('this page and the server have different versions; reload it');
   const frame = {
     flags: view.getUint8(1), seq: view.getUint32(4, true), step: view.getUint32(8, true), oldest: view.getUint32(12, true),
     newest: view.getUint32(16, true), actionId: view.getUint32(20, true), generationMs: view.getFloat32(24, true),

@@ -1,4 +1,4 @@
-// The map of what a world knows: its keyframes as small cones of sight, floors as tiles, where the camera is, and its path.
+// The map of a world's memory: its keyframes as small view cones, floors as tiles, the camera, and its path.
 
 const COLOURS = [null, '#8fa3c4', '#7fe3c4', '#f0c274', '#4a5366'];
 const NAMES = ['', 'recorded', 'observed', 'imagined', 'walkable'], WALKABLE = 4;

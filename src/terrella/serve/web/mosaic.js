@@ -1,4 +1,4 @@
-// The map of a flat world: what was seen so far, pictures joined by how they scrolled, and a frame around the picture of now.
+// The map of a flat world: its pictures stitched by how they scrolled, with a frame around the current one.
 
 const EASE_MS = 260, LOOSE = 0.7, ROUND = 3, MORE = 1.2;
 

@@ -1,4 +1,4 @@
-// The timeline below the picture: how far back one can go, where one stands, and the ways there.
+// The timeline below the picture: the range of the past, and the moment shown.
 
 const $ = (id) => document.getElementById(id);
 

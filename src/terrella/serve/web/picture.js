@@ -10,7 +10,7 @@ export function takePictures(root, input, size, send, say, isGoal) {
       if (file.size > MOST_BYTES) throw new Error('it is larger than 64 MB');
       send(await scaled(file, size()), asGoal);
     } catch (error) {
-      const why = error instanceof DOMException ? 'this is no image that the browser can read' : error.message;
+      const why = error instanceof DOMException ? 'the browser cannot read this image' : error.message;
       say(`No picture: ${why}.`);
     }
   };

@@ -1,4 +1,4 @@
-// The pictures: a canvas for each world and camera, as large as fits, and their light on the wall behind.
+// The pictures: a canvas for each world and camera, as large as fits, and a glow behind them.
 
 const GAP = 14;
 

@@ -1,4 +1,4 @@
-// The thin bar under the picture that shows the error to expect of it.
+// The thin bar under the picture that shows its expected error.
 
 const WORDS = { low: 'Low uncertainty', medium: 'Raised uncertainty', high: 'High uncertainty' };
 
@@ -29,6 +29,6 @@ export class Uncertainty {
     this.root.dataset.level = this.level;
     this.root.ariaValueMax = 1.6 * high;
     this.root.ariaValueNow = this.value;
-    this.root.title = `${WORDS[this.level]}: the picture is expected to be off by ${(100 * this.value).toFixed(1)}% of full brightness`;
+    this.root.title = `${WORDS[this.level]}: expected error of the picture: ${(100 * this.value).toFixed(1)}% of full brightness`;
   }
 }

@@ -1,4 +1,4 @@
-// What is shown beside the picture itself: the map, the tint of what is invented, and one camera or all.
+// Options of the view: the map, the tint of invented pixels, and one camera or all.
 
 import { MemoryMap } from './map.js';
 import { MosaicMap } from './mosaic.js';

@@ -31,10 +31,10 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     left out, with a warning that counts it. DatasetError says what is wrong with a file."""
     path = Path(path)
     if path.suffix.lower() in GLTF_ENDINGS:
-        found = read_gltf(path)
-        if not isinstance(found, Gaussians):
+        scene = read_gltf(path)
+        if not isinstance(scene, Gaussians):
             raise DatasetError(f"{path} holds triangles and no Gaussians; `terrella space build` makes a world of it.")
-        return _sound(found, path, axes or "rub")
+        return _valid_part(scene, path, axes or "rub")
     try:
         data = b"" if path.is_dir() else path.read_bytes()
     except OSError as error:
@@ -44,36 +44,36 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     try:
         if data[:3] == b"ply":
             elements = ply.parse(data)
-            found = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
+            scene = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
             usual = "rdf"
         elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
-            found, usual = spz.decode(data), "rub"
+            scene, usual = spz.decode(data), "rub"
         elif data[:2] == b"PK":
-            found, usual = sog.zipped(data), "rdf"
+            scene, usual = sog.zipped(data), "rdf"
         elif path.is_dir() or path.name == sog.META:
-            found, usual = sog.unzipped(path if path.is_dir() else path.parent), "rdf"
+            scene, usual = sog.unzipped(path if path.is_dir() else path.parent), "rdf"
         else:
             raise ValueError("it is neither PLY nor SPZ nor SOG")
     except (ValueError, KeyError, OverflowError) as error:
-        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise DatasetError(f"{path} cannot be opened as Gaussians: {said}; export it again as PLY or SPZ.") from error
-    return _sound(found, path, axes or usual)
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(f"{path} cannot be opened as Gaussians: {reason}; export it again as PLY or SPZ.") from error
+    return _valid_part(scene, path, axes or usual)
 
 
-def _sound(found: Gaussians, path: Path, axes: str) -> Gaussians:
+def _valid_part(scene: Gaussians, path: Path, axes: str) -> Gaussians:
     """Those whose numbers are finite and whose places are not absurd, in our axes."""
-    sound = torch.stack(
-        [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(found).values()]
+    valid = torch.stack(
+        [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(scene).values()]
     )
-    sound = sound.all(0) & (found.quats.norm(dim=1) > 0) & (found.means.abs() < FARTHEST_M).all(1)
-    if not sound.any():
+    valid = valid.all(0) & (scene.quats.norm(dim=1) > 0) & (scene.means.abs() < FARTHEST_M).all(1)
+    if not valid.any():
         raise DatasetError(f"{path} has no Gaussian with finite numbers within 10 km; export it again.")
-    if lost := int((~sound).sum()):
+    if lost := int((~valid).sum()):
         warnings.warn(
-            f"{lost:,} of its {len(sound):,} Gaussians are left out: not finite, farther than 10 km, or with a quaternion of 0.",
+            f"{lost:,} of its {len(valid):,} Gaussians are left out: not finite, farther than 10 km, or with a quaternion of 0.",
             stacklevel=3,
         )
-    return transform(found.at(sound), _axes(axes).T)
+    return transform(scene.at(valid), _axes(axes).T)
 
 
 def write_scene(
@@ -87,11 +87,11 @@ def write_scene(
         raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
     if kind == "compressed" and path.suffix.lower() != ".ply":
         raise DatasetError(f"{path}: the compressed kind is one of .ply; SPZ is compressed by itself.")
-    there = transform(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
+    exported = transform(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
     if path.suffix.lower() == ".spz":
-        data = spz.encode(there, version)
+        data = spz.encode(exported, version)
     else:
-        data = compressed.encode(there) if kind == "compressed" else ply.encode(there)
+        data = compressed.encode(exported) if kind == "compressed" else ply.encode(exported)
     replace_whole(path, lambda staged: staged.write_bytes(data))
 
 

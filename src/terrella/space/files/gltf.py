@@ -61,10 +61,10 @@ class Gltf:
         end = min(_whole(view, "byteOffset", 0) + _whole(view, "byteLength"), len(self._buffer(view)))
         if not count or start + stride * (count - 1) + width * kind.itemsize > end:
             raise ValueError(f"it ends before the {count:,} rows of its accessor {index} do")
-        found = np.ndarray((count, width), kind, self._buffer(view), start, (stride, kind.itemsize))
+        rows = np.ndarray((count, width), kind, self._buffer(view), start, (stride, kind.itemsize))
         if about.get("normalized") and kind.kind in "iu":
-            return np.maximum(found.astype(np.float32) / np.iinfo(kind).max, -1)
-        return found
+            return np.maximum(rows.astype(np.float32) / np.iinfo(kind).max, -1)
+        return rows
 
     def picture(self, texture: Any) -> np.ndarray:
         """The picture of a texture: uint8 [height, width, 4], at most SIDE a side; its size is looked at before it is unpacked."""
@@ -119,7 +119,7 @@ def open_gltf(path: Path) -> Gltf:
 
 def _chunks(data: bytes) -> tuple[bytes, bytes]:
     """The JSON of a .glb, and its bytes."""
-    found, at = {}, 12
+    chunks, at = {}, 12
     if len(data) < 20:
         raise ValueError("it ends within its header")
     version, length = struct.unpack_from("<II", data, 4)
@@ -131,9 +131,9 @@ def _chunks(data: bytes) -> tuple[bytes, bytes]:
         size, kind = struct.unpack_from("<I4s", data, at)
         if at + 8 + size > length:
             raise ValueError("it ends within one of its chunks")
-        found.setdefault(kind, data[at + 8 : at + 8 + size])
+        chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
-    return found[b"JSON"], found.get(b"BIN\0", b"")
+    return chunks[b"JSON"], chunks.get(b"BIN\0", b"")
 
 
 def _of_uri(uri: Any, folder: Path) -> bytes:
@@ -151,7 +151,7 @@ def _of_uri(uri: Any, folder: Path) -> bytes:
 
 def _whole(about: dict[str, Any], name: str, usual: int | None = None) -> int:
     """A count or length that the JSON states."""
-    found = about.get(name, usual)
-    if type(found) is not int or found < 0:
-        raise ValueError(f"its {name} is {str(found)[:20]}, which is no length")
-    return found
+    value = about.get(name, usual)
+    if type(value) is not int or value < 0:
+        raise ValueError(f"its {name} is {str(value)[:20]}, which is no length")
+    return value

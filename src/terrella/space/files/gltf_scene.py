@@ -83,9 +83,9 @@ def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
         RecursionError,
         Image.DecompressionBombError,
     ) as error:
-        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error) or type(error).__name__
         raise DatasetError(
-            f"{path} cannot be opened as glTF: {said.splitlines()[0].rstrip('.')}; export it again."
+            f"{path} cannot be opened as glTF: {reason.splitlines()[0].rstrip('.')}; export it again."
         ) from error
 
 
@@ -111,18 +111,18 @@ def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[dict[str, Any], np.n
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
     if "matrix" in node:
-        found = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        matrix = np.array(node["matrix"], np.float64).reshape(4, 4).T
     else:
         x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64).reshape(4)
         turn = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
                          [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
                          [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])  # fmt: skip
-        found = np.eye(4)
-        found[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
-        found[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
-    if not np.isfinite(found).all():
+        matrix = np.eye(4)
+        matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        matrix[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    if not np.isfinite(matrix).all():
         raise ValueError("a node of it is moved by what is no number")
-    return found
+    return matrix
 
 
 def _parts(file: Gltf, node: dict[str, Any]) -> list[dict[str, Any]]:
@@ -174,10 +174,10 @@ def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarr
     rows[:, 3:7] = 1
     for name, first, widths in (("COLOR_0", 3, (3, 4)), ("TEXCOORD_0", 7, (2,))):
         if name in given:
-            found = file.numbers(given[name], *widths)
-            if len(found) != count:
-                raise ValueError(f"its {name} are {len(found):,} and its points {count:,}")
-            rows[:, first : first + found.shape[1]] = found
+            values = file.numbers(given[name], *widths)
+            if len(values) != count:
+                raise ValueError(f"its {name} are {len(values):,} and its points {count:,}")
+            rows[:, first : first + values.shape[1]] = values
     index = file.numbers(part["indices"], 1)[:, 0].astype(np.int64) if "indices" in part else np.arange(count)
     if len(index) and not 0 <= index.min() <= index.max() < count:
         raise ValueError("a triangle of it has a corner which it has not")
@@ -213,7 +213,7 @@ def _material(file: Gltf, about: dict[str, Any], pictures: dict[int, np.ndarray]
 
 
 def _lights(file: Gltf, nodes: list) -> tuple[Light, ...]:
-    known, found = file.about.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", []), []
+    known, lights = file.about.get("extensions", {}).get("KHR_lights_punctual", {}).get("lights", []), []
     for node, matrix in nodes:
         which = node.get("extensions", {}).get("KHR_lights_punctual", {}).get("light")
         if which is None:
@@ -227,8 +227,8 @@ def _lights(file: Gltf, nodes: list) -> tuple[Light, ...]:
             raise ValueError("one of its lights is none")
         cone = float(np.cos(edges[0])), float(np.cos(edges[1]))
         length = max(float(np.linalg.norm(towards)), 1e-9)
-        found.append(Light(about["type"], matrix[:3, 3] @ _AXES, towards / length, power, cone))
-    return tuple(found[:MOST_LIGHTS])
+        lights.append(Light(about["type"], matrix[:3, 3] @ _AXES, towards / length, power, cone))
+    return tuple(lights[:MOST_LIGHTS])
 
 
 def _gaussians(file: Gltf, matrix: np.ndarray, attributes: dict[str, Any]) -> Gaussians:
@@ -239,9 +239,9 @@ def _gaussians(file: Gltf, matrix: np.ndarray, attributes: dict[str, Any]) -> Ga
     many = max((n for n in (1, 4, 9, 16) if set(orders[:n]) <= given.keys()), default=1)
     sh = torch.stack([take(name, 3) for name in orders[:many]], 1)
     places, turns, sizes = take("POSITION", 3), take("ROTATION", 4)[:, [3, 0, 1, 2]], take("SCALE", 3)
-    found = Gaussians(places, turns, sizes, take("OPACITY", 1)[:, 0], sh)
+    scene = Gaussians(places, turns, sizes, take("OPACITY", 1)[:, 0], sh)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     rot = matrix[:3, :3] / max(scale, 1e-9)
     if not np.allclose(rot @ rot.T, np.eye(3), atol=1e-3):
         raise ValueError("its Gaussians are mirrored, or scaled by another factor along each axis")
-    return transform(found, torch.from_numpy(rot).float(), scale, torch.from_numpy(matrix[:3, 3]).float())
+    return transform(scene, torch.from_numpy(rot).float(), scale, torch.from_numpy(matrix[:3, 3]).float())

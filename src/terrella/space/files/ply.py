@@ -36,14 +36,14 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
             if len(words) != 3 or words[1] not in _TYPES or not tables or len(tables[-1][2]) >= 1000:
                 raise ValueError(f"its property line '{' '.join(words)[:80]}' is not understood")
             tables[-1][2].append((words[2], _TYPES[words[1]]))
-    found = {}
+    elements = {}
     for name, count, columns in tables:
         kind = np.dtype(columns)  # ValueError for columns of one name
         if body + count * kind.itemsize > len(data):
             raise ValueError(f"it ends before its {count:,} rows of '{name}' do")
-        found[name] = np.frombuffer(data, kind, count, body)
+        elements[name] = np.frombuffer(data, kind, count, body)
         body += count * kind.itemsize
-    return found
+    return elements
 
 
 def decode(elements: dict[str, np.ndarray]) -> Gaussians:

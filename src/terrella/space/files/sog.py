@@ -59,10 +59,10 @@ def _decoded(read: Callable[[str], bytes]) -> Gaussians:
 
 def _gaussians(meta: Mapping[str, Any], count: int, picture: Callable[..., np.ndarray]) -> Gaussians:
     def rows(of: str, k: int = 0) -> np.ndarray:
-        found = picture(of, k).reshape(-1, 4)
-        if len(found) < count:
-            raise ValueError(f"its picture of {of} has {len(found):,} pixels for {count:,} points")
-        return found[:count]
+        pixels = picture(of, k).reshape(-1, 4)
+        if len(pixels) < count:
+            raise ValueError(f"its picture of {of} has {len(pixels):,} pixels for {count:,} points")
+        return pixels[:count]
 
     low, high = (np.array(meta["means"][end], np.float32) for end in ("mins", "maxs"))
     share = (rows("means")[:, :3] | rows("means", 1)[:, :3].astype(np.uint16) << 8).astype(np.float32) / 65535
@@ -89,10 +89,10 @@ def _gaussians(meta: Mapping[str, Any], count: int, picture: Callable[..., np.nd
 
 
 def _codebook(meta: Mapping[str, Any], of: str) -> np.ndarray:
-    found = np.array(meta[of]["codebook"], np.float32)
-    if found.shape != (256,):
+    codebook = np.array(meta[of]["codebook"], np.float32)
+    if codebook.shape != (256,):
         raise ValueError(f"its codebook of {of} has not 256 numbers")
-    return found
+    return codebook
 
 
 def _picture(data: bytes) -> np.ndarray:

@@ -131,15 +131,15 @@ def _first_three(part: torch.Tensor) -> torch.Tensor:
 def _smallest_three(part: np.ndarray) -> torch.Tensor:
     """Of x, y, z, w which is largest (2 bits), the others from the last one on: 9 bits and a sign each."""
     packed = np.ascontiguousarray(part).view("<u4")[:, 0].astype(np.int64)
-    which, found = packed >> 30, np.zeros((len(packed), 4), np.float32)
+    which, quats = packed >> 30, np.zeros((len(packed), 4), np.float32)
     for axis in (3, 2, 1, 0):
         here = which != axis
         value = (packed & 511) / 511 * 0.5**0.5 * np.where(packed & 512, -1, 1)
-        found[here, axis] = value[here]
+        quats[here, axis] = value[here]
         packed = np.where(here, packed >> 10, packed)
-    rest = np.sqrt(np.maximum(1 - (found**2).sum(1), 0))
-    found[np.arange(len(found)), which] = rest
-    return torch.from_numpy(found[:, [3, 0, 1, 2]])
+    rest = np.sqrt(np.maximum(1 - (quats**2).sum(1), 0))
+    quats[np.arange(len(quats)), which] = rest
+    return torch.from_numpy(quats[:, [3, 0, 1, 2]])
 
 
 def encode(gaussians: Gaussians, version: Version = 3) -> bytes:

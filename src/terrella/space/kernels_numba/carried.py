@@ -10,7 +10,7 @@ from .planes import between
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def moved(u, v, depth, turn, position, new_turn, new_position, camera):
+def reproject(u, v, depth, turn, position, new_turn, new_position, camera):
     """Where the surface that is depth[v, u] deep in the view from turn [3, 3] and position [3] lies in that from
     the new ones: how far ahead, and its image coordinates (in [0, 1] where it is seen; meaningless where it lies behind)."""
     rows, columns = depth.shape
@@ -36,7 +36,7 @@ def carry(rgb, depth, turn, position, known, seen, target_turn, target_position,
             wanted = 1 - known[v, u]
             if wanted <= 0:
                 continue
-            ahead, a, b = moved(u, v, seen, target_turn, target_position, turn, position, camera)
+            ahead, a, b = reproject(u, v, seen, target_turn, target_position, turn, position, camera)
             if ahead <= NEAR_M or a < 0 or a > 1 or b < 0 or b > 1:
                 continue
             i, j = min(int(a * depth.shape[1]), depth.shape[1] - 1), min(int(b * depth.shape[0]), depth.shape[0] - 1)
@@ -72,21 +72,21 @@ def splat(depth, things, turn, position, target_turn, target_position, flat, can
                     counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left]
                 )
             flat[v, u] = far
-            ahead, a, b = moved(u, v, flat, turn, position, target_turn, target_position, camera)
+            ahead, a, b = reproject(u, v, flat, turn, position, target_turn, target_position, camera)
             a, b = a * width, b * height
             if ahead > NEAR_M and 0 <= a < width and 0 <= b < height and ahead < canvas[int(b), int(a)]:
                 canvas[int(b), int(a)] = ahead
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_position, found, camera):
+def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_position, carried, camera):
     """The second half of the same: what the frame shows (rgb uint8 [3, H, W], the others [H, W]) of what the target sees [H, W];
-    fills found [6, H, W] = colour, trust, `seen`, things."""
+    fills carried [6, H, W] = colour, trust, `seen`, things."""
     height, width = flat.shape
     for v in range(height):
         for u in range(width):
-            found[4, v, u] = seen[v, u]
-            ahead, a, b = moved(u, v, seen, target_turn, target_position, turn, position, camera)
+            carried[4, v, u] = seen[v, u]
+            ahead, a, b = reproject(u, v, seen, target_turn, target_position, turn, position, camera)
             if ahead <= NEAR_M or a < 0 or a > 1 or b < 0 or b > 1:
                 continue
             i, j = min(int(a * width), width - 1), min(int(b * height), height - 1)
@@ -94,5 +94,5 @@ def fetch(rgb, flat, things, covered, turn, position, seen, target_turn, target_
             if covered[j, i] or trust <= 0:
                 continue
             for c in range(3):
-                found[c, v, u] = rgb[c, j, i] / 255
-            found[3, v, u], found[5, v, u] = trust, things[j, i]
+                carried[c, v, u] = rgb[c, j, i] / 255
+            carried[3, v, u], carried[5, v, u] = trust, things[j, i]

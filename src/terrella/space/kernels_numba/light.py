@@ -33,9 +33,9 @@ def first_box(x, y, z, dx, dy, dz, boxes, far):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def meet(first, last, points, sides, ways, boxes, starts, counts, found):
+def meet(first, last, points, sides, ways, boxes, starts, counts, hits):
     """Which texel of a light map each ray meets: from points [T, 3] on sides [T], along ways [R, 3] (hemispheres about z, turned by
-    each point's number), boxes [K, 6]; starts [6 K], the first texel of each side, and counts [6 K, 2]; found int32 [T, R]."""
+    each point's number), boxes [K, 6]; starts [6 K], the first texel of each side, and counts [6 K, 2]; hits int32 [T, R]."""
     for t in range(first, last):
         axis, sign = sides[t] // 2, 1.0 if sides[t] % 2 else -1.0
         spin = (t * 0.6180339887498949) % 1.0 * 2 * np.pi
@@ -50,14 +50,14 @@ def meet(first, last, points, sides, ways, boxes, starts, counts, found):
                 dx, dy, dz = u, v, w
             x, y, z = points[t]
             k, far, side = first_box(x, y, z, dx, dy, dz, boxes, 1e9)
-            found[t, r] = -1
+            hits[t, r] = -1
             if k >= 0:
                 p = (x + far * dx, y + far * dy, z + far * dz)
                 a0, b0 = 0 if side >= 2 else 1, 2 if side < 4 else 1
                 many, wide = counts[6 * k + side], boxes[k]
                 i = min(int((p[a0] - wide[a0]) / max(wide[3 + a0] - wide[a0], 1e-9) * many[0]), many[0] - 1)
                 j = min(int((p[b0] - wide[b0]) / max(wide[3 + b0] - wide[b0], 1e-9) * many[1]), many[1] - 1)
-                found[t, r] = starts[6 * k + side] + max(i, 0) * many[1] + max(j, 0)
+                hits[t, r] = starts[6 * k + side] + max(i, 0) * many[1] + max(j, 0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -71,12 +71,12 @@ def shine(first, last, points, normals, lamps, power, lamp_normals, boxes, light
                 continue
             dx, dy, dz = dx / far, dy / far, dz / far
             here = normals[t, 0] * dx + normals[t, 1] * dy + normals[t, 2] * dz
-            there = -(lamp_normals[m, 0] * dx + lamp_normals[m, 1] * dy + lamp_normals[m, 2] * dz)
-            if here <= 0 or there <= 0:
+            facing = -(lamp_normals[m, 0] * dx + lamp_normals[m, 1] * dy + lamp_normals[m, 2] * dz)
+            if here <= 0 or facing <= 0:
                 continue
             k, _, _ = first_box(points[t, 0], points[t, 1], points[t, 2], dx, dy, dz, boxes, far - 0.01)
             if k < 0:
-                share = here * there / (np.pi * max(far * far, 0.02))
+                share = here * facing / (np.pi * max(far * far, 0.02))
                 for c in range(3):
                     light[t, c] += share * power[m, c]
 

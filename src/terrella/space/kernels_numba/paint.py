@@ -50,9 +50,9 @@ def paint(picture, sides, far, number, hides, rgb, depth, instances):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def paint_views(first, last, order, there, pictures, sides, far, hides, rgb, depth, instances):
-    """`paint` of all billboards [B, K], of which there [B, K] are, each view's in its order [B, K], the nearest last."""
+def paint_views(first, last, order, present, pictures, sides, far, hides, rgb, depth, instances):
+    """`paint` for the billboards of all views that are `present` bool [B, K], in their `order` [B, K], the nearest last."""
     for b in range(first, last):
         for k in order[b]:
-            if there[b, k]:
+            if present[b, k]:
                 paint(pictures[b, k], sides[b, k], far[b, k], k + 1, hides[b], rgb[b], depth[b], instances[b])

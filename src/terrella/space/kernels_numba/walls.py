@@ -11,8 +11,8 @@ WITHIN_M = 0.005  # as well as walls are known
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def straight_runs(inverse, found, left, fewest, straight, gap, least):
-    """The kernel of floorplan.straight_runs_slowly for one row: fills found [n, 4] = first, stop, slope, level of runs of columns
+def straight_runs(inverse, runs, left, fewest, straight, gap, least):
+    """The kernel of floorplan.straight_runs_slowly for one row: fills runs [n, 4] = first, stop, slope, level of runs of columns
     on which the inverse depth [w] is a line of `left` [w], as far as neighbours are less than `gap` metres apart and no inverse
     depth is below `least`."""
     count, first = 0, 0
@@ -32,19 +32,19 @@ def straight_runs(inverse, found, left, fewest, straight, gap, least):
                 break
             stop += 1
             if stop - first >= fewest:
-                found[count, 0], found[count, 1], found[count, 2] = first, stop, slope
-                found[count, 3] = mean - slope * middle
+                runs[count, 0], runs[count, 1], runs[count, 2] = first, stop, slope
+                runs[count, 3] = mean - slope * middle
         if stop - first >= fewest:
             count += 1
             first = stop
         else:
             first += 1
-    found[count:] = 0  # what was begun after the last
+    runs[count:] = 0  # what was begun after the last
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def slide(first, last, walls, own, places, wish, half, short, moved, left):
-    """The kernel of floorplan.slide: walls [S, 4] of all, own [B, n, 4], places and wish [B, 2]; fills moved and left [B, 2]."""
+def slide(first, last, walls, own, places, wish, half, short, shift, left):
+    """The kernel of floorplan.slide: walls [S, 4] of all, own [B, n, 4], places and wish [B, 2]; fills shift and left [B, 2]."""
     close = np.empty((len(walls) + own.shape[1], 4))
     for n in range(first, last):
         x, y, mx, my = places[n, 0], places[n, 1], wish[n, 0], wish[n, 1]
@@ -60,7 +60,7 @@ def slide(first, last, walls, own, places, wish, half, short, moved, left):
             x, y = x + go * mx, y + go * my
             rest = (1 - max(share, 0.0)) * (mx * along_x + my * along_y) if bump < 2 else 0.0
             mx, my = rest * along_x, rest * along_y
-        moved[n, 0], moved[n, 1], left[n, 0], left[n, 1] = x - places[n, 0], y - places[n, 1], mx, my
+        shift[n, 0], shift[n, 1], left[n, 0], left[n, 1] = x - places[n, 0], y - places[n, 1], mx, my
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

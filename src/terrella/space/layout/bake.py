@@ -1,6 +1,6 @@
-"""Blocks as Gaussians: flat ones laid out in a grid on every side that can be seen, lit as radiosity (Goral et al. 1984) has it.
+"""Blocks as flat Gaussians in a grid on every visible side, lit by radiosity (Goral et al. 1984).
 
-A light map of texels takes what lamps, windows and the sun send, and what other texels throw back, three times over.
+A light map of texels gathers the light of lamps, windows and the sun, and of three bounces between texels.
 """
 
 from __future__ import annotations
@@ -22,50 +22,47 @@ from .room_layout import RoomLayout
 
 TEXEL_M = 0.14
 RAYS = 64
-LAMPS = 40  # points that stand for all that shines, and as many more for each further room
+LAMPS = 40  # point lights that approximate all light sources, per room
 BOUNCES = 3
-SLIM_M = 0.05  # narrower sides of what shines send no light
-SUN = 14.0  # beside a white wall in the open
-OPACITY, OVERLAP = 0.99, 0.7  # of neighbours in a grid: standard deviation in shares of their distance
+SLIM_M = 0.05  # narrower sides emit no light
+SUN = 14.0  # brightness, relative to a white wall outdoors
+OPACITY, OVERLAP = 0.99, 0.7  # standard deviation of a Gaussian as a share of the grid's spacing
 FINEST_M, THIN_M = 0.006, 0.0015
 _AXES = ((1, 2), (0, 2), (0, 1))  # the two axes along a side, for each axis across it
 
 
 @dataclass(frozen=True)
 class BuiltPlace:
-    """A place built of a plan: Gaussians, the object of each int32 [N] (0: the building), names of objects 1, 2, ...; solids
-    float32 [S, 6], boxes that stop bodies, and int32 [S] the object of each that can be pushed (0: none); starts [R, 7], a pose on
-    the floor of each room (the height is the floor's)."""
+    """A place built from a layout."""
 
     gaussians: Gaussians
-    objects: torch.Tensor
-    names: tuple[str, ...]
-    solids: torch.Tensor
-    bodies: torch.Tensor
-    starts: torch.Tensor
+    objects: torch.Tensor  # int32 [N], the object of each Gaussian (0: the building)
+    names: tuple[str, ...]  # of objects 1, 2, ...
+    solids: torch.Tensor  # float32 [S, 6], boxes that stop walkers
+    bodies: torch.Tensor  # int32 [S], the movable object of each box (0: none)
+    starts: torch.Tensor  # float32 [R, 7], a pose in each room, at the height of its floor
 
 
 @dataclass
 class _Grid:
-    """Cells on the sides of blocks: middles [N, 3], side 0..5 of its block [N], block [N], width along both axes [N, 2], and of
-    each side of each block the first cell [6 K] and how many [6 K, 2]."""
+    """Cells on the sides of K blocks."""
 
-    points: np.ndarray
-    sides: np.ndarray
-    blocks: np.ndarray
-    widths: np.ndarray
-    starts: np.ndarray
-    counts: np.ndarray
+    points: np.ndarray  # [N, 3], middles of the cells
+    sides: np.ndarray  # [N], the side 0..5 of the block
+    blocks: np.ndarray  # [N]
+    widths: np.ndarray  # [N, 2], along both axes of the side
+    starts: np.ndarray  # [6 K], the first cell of each side
+    counts: np.ndarray  # [6 K, 2], cells along both axes of each side
 
     @property
     def normals(self) -> np.ndarray:
-        found = np.zeros_like(self.points)
-        found[np.arange(len(found)), self.sides // 2] = np.where(self.sides % 2, 1.0, -1.0)
-        return found
+        normals = np.zeros_like(self.points)
+        normals[np.arange(len(normals)), self.sides // 2] = np.where(self.sides % 2, 1.0, -1.0)
+        return normals
 
 
 def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
-    """The place of a plan, of about `count` Gaussians. ContractError for what does not fit. The same plan, the same numbers."""
+    """Builds a layout with about `count` Gaussians. The same layout gives the same place. ContractError if parts do not fit."""
     blocks = blocks_of(plan)
     boxes, bodies = blocks.boxes, blocks.bodies
     air = np.array([[*low, *high] for low, high in blocks.air])
@@ -115,19 +112,19 @@ def _grid(boxes: np.ndarray, spacing: np.ndarray) -> _Grid:
 
 
 def _bare(grid: _Grid, boxes: np.ndarray, air: np.ndarray) -> np.ndarray:
-    """Which cells have air before them: bool [N]."""
+    """Whether cells have air in front of them: bool [N]."""
     front = grid.points + 0.004 * grid.normals
     return _in(front, air) & ~_in(front, boxes)
 
 
 def _in(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    found = np.empty(len(points), np.bool_)
-    over_views(len(points), lambda first, last: kernels.in_any(first, last, points, boxes, 0.0, found))
-    return found
+    inside = np.empty(len(points), np.bool_)
+    over_views(len(points), lambda first, last: kernels.in_any(first, last, points, boxes, 0.0, inside))
+    return inside
 
 
 def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray, bodies: np.ndarray) -> _Grid:
-    """The cells that can be seen, at once or after things were pushed away."""
+    """The cells that are visible, now or after objects were pushed away."""
     bare, whose = _bare(grid, boxes[bodies == 0], air), bodies[grid.blocks]
     for number in np.unique(bodies[bodies > 0]):
         rows = np.flatnonzero(whose == number)
@@ -136,7 +133,7 @@ def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray, bodies: np.ndarray) -
 
 
 def _light(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
-    """How much light falls on each texel: [T, 3]."""
+    """Irradiance of each texel: [T, 3]."""
     rows = np.flatnonzero(bare)
     normals = texels.normals[rows]
     points = texels.points[rows] + 0.003 * normals
@@ -145,33 +142,33 @@ def _light(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, texels: _Grid, b
     shines = np.array([one.glow for one in look]) * (_narrow(texels, boxes)[rows] > SLIM_M)
     glow = shines[:, None]
     direct = _direct(plan, blocks, boxes, points, normals, texels.widths[rows].prod(1), glow * colour)
-    found = np.empty((len(rows), RAYS), np.int32)
+    hits = np.empty((len(rows), RAYS), np.int32)
     ways, sides = _ways(), texels.sides[rows]
     over_views(
         len(rows),
-        lambda first, last: kernels.meet(first, last, points, sides, ways, boxes, texels.starts, texels.counts, found),
+        lambda first, last: kernels.meet(first, last, points, sides, ways, boxes, texels.starts, texels.counts, hits),
     )
     at = np.full(len(bare) + 1, -1)
     at[rows] = np.arange(len(rows))
-    found = at[found]  # the number among the bare, the last for none
+    hits = at[hits]  # the number among the bare, the last for none
     albedo = np.where(glow > 0, 0.0, 0.9 * colour)
     light, total = np.zeros((len(bare), 3)), direct
     for _ in range(BOUNCES):
         thrown = np.concatenate([albedo * total, np.zeros((1, 3))]).astype(np.float32)
-        light[rows] = thrown[found].mean(1)
+        light[rows] = thrown[hits].mean(1)
         total = direct + _smooth(texels, bare, light)[rows]
     light[rows] = total
     return light
 
 
 def _narrow(grid: _Grid, boxes: np.ndarray) -> np.ndarray:
-    """The shorter edge of the side on which each cell is [N]."""
+    """The shorter edge of each cell's side [N]."""
     axes = np.array(_AXES)[grid.sides // 2]
     return (boxes[grid.blocks[:, None], axes + 3] - boxes[grid.blocks[:, None], axes]).min(1)
 
 
 def _smooth(grid: _Grid, bare: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values [T, 3], each the mean over itself and its bare neighbours on the same side, twice."""
+    """Values [T, 3] smoothed twice over visible neighbours on the same side."""
     for first, (rows, columns) in zip(grid.starts, grid.counts):
         part = slice(first, first + rows * columns)
         open_ = np.pad(bare[part].reshape(rows, columns, 1).astype(float), ((1, 1), (1, 1), (0, 0)))
@@ -184,7 +181,7 @@ def _smooth(grid: _Grid, bare: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _direct(plan, blocks, boxes, points, normals, areas, glow) -> np.ndarray:
-    """What lamps, panes and the sun send to points [T, 3]; glow [T, 3] says which of them shine."""
+    """Direct light of lamps, windows and the sun at points [T, 3]; glow [T, 3] is their own emission."""
     light = np.zeros((len(points), 3))
     weight = areas * glow.sum(1)
     if weight.sum() > 0:
@@ -211,7 +208,7 @@ def _sun(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, points: np.ndarray
 
 
 def _ways() -> np.ndarray:
-    """RAYS directions about z, as dense as their cosine: [R, 3]."""
+    """RAYS cosine-weighted directions about z: [R, 3]."""
     at = (np.arange(RAYS) + 0.5) / RAYS
     turn = np.arange(RAYS) * (math.pi * (3 - math.sqrt(5)))
     across = np.sqrt(at)
@@ -241,8 +238,8 @@ def _brightness(plan, blocks, boxes, cells, texels, bare, light) -> np.ndarray:
 
 
 def exposed(own: np.ndarray, falls: np.ndarray, shines: np.ndarray) -> np.ndarray:
-    """Colours [N, 3] as a camera shows surfaces of the colours `own` on which so much light falls [N, 3]; those that shine, bool
-    [N], as they are."""
+    """Colours [N, 3] as a camera shows them: surfaces of the colours `own` under the light `falls` [N, 3]; light sources, `shines`
+    bool [N], keep their colours."""
     shown = own**2.2 * falls
     middle = np.exp(np.log(np.maximum(falls[~shines].mean(1), 1e-4)).mean()) if not shines.all() else 1.0
     shown = shown * (0.62 / middle)
@@ -257,7 +254,7 @@ def _texel_sun(plan, blocks, boxes, texels) -> np.ndarray:
 
 
 def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Values [T, 3] of bare texels between which cells lie, on the same side of the same block: [N, 3]."""
+    """Values [T, 3] of visible texels interpolated at cells of the same side: [N, 3]."""
     face = 6 * cells.blocks + cells.sides
     axes = np.array(_AXES)[cells.sides // 2]
     rows = np.arange(len(face))
@@ -299,7 +296,7 @@ def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:
 
 
 def _starts(plan: RoomLayout, blocks: Blocks) -> torch.Tensor:
-    """Where one begins: as the plan says, or in each room at the free place that looks furthest, along its longer side."""
+    """The starts: that of the layout, or in each room the free place with the longest view along its longer side."""
     if plan.start is not None:
         x, y, degrees = plan.start
         room = next(r for r in plan.rooms if all(r.low[k] <= plan.start[k] <= r.high[k] for k in range(2)))

@@ -1,4 +1,4 @@
-"""A plan as blocks: every wall, frame, step and table leg an upright box with a look, and the air between them."""
+"""A layout as axis-aligned boxes with looks: walls, frames, steps, table legs, and the air between them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from .furniture import kind_of
 from .looks import Look, look_of
 from .room_layout import REACH_M, WALL_M, WALLS, Door, Room, RoomLayout, Stairs, Thing, Window, room_at
 
-RISER_M = 0.18  # steps of stairs are at most so high
+RISER_M = 0.18  # largest height of a step
 FRAME_M = 0.05
 _LEAF_M = 0.04
-INSIDE_M = 2e-3  # deeper in something else nothing can be pushed
-LEVEL_M = 0.35  # a door joins floors that differ by no more
+INSIDE_M = 2e-3  # an object that overlaps another by more cannot be pushed
+LEVEL_M = 0.35  # largest difference of the floors that a door joins
 _TURNS = {"south": 0, "east": 1, "north": 2, "west": 3}  # quarter turns to the left
 
 Corner = tuple[float, float, float]
@@ -25,17 +25,16 @@ Corner = tuple[float, float, float]
 
 @dataclass
 class Blocks:
-    """low, high: corners of K boxes [3] each; looks; objects: which thing each belongs to, 0 for the building; solid: whether
-    bodies meet it; air: boxes in which one can be; names: of objects 1, 2, ...; movable: which of them can be pushed."""
+    """K boxes, the air between them, and the objects that they form."""
 
     low: list[Corner] = field(default_factory=list)
     high: list[Corner] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
-    objects: list[int] = field(default_factory=list)
-    solid: list[bool] = field(default_factory=list)
-    air: list[tuple[Corner, Corner]] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-    movable: set[int] = field(default_factory=set)
+    objects: list[int] = field(default_factory=list)  # the object that each belongs to, 0 for the building
+    solid: list[bool] = field(default_factory=list)  # whether each stops walkers
+    air: list[tuple[Corner, Corner]] = field(default_factory=list)  # boxes of free space
+    names: list[str] = field(default_factory=list)  # of objects 1, 2, ...
+    movable: set[int] = field(default_factory=set)  # the objects that can be pushed
 
     def add(self, low: Sequence[float], high: Sequence[float], look: Look, thing: int = 0, solid: bool = True) -> None:
         self.low.append((low[0], low[1], low[2]))
@@ -51,7 +50,7 @@ class Blocks:
 
     @property
     def solids(self) -> np.ndarray:
-        """float32 [S, 6], the boxes that stop bodies: low and high corners."""
+        """float32 [S, 6], the boxes that stop walkers: low and high corners."""
         return self.boxes[np.asarray(self.solid)].astype(np.float32)
 
     @property
@@ -61,20 +60,20 @@ class Blocks:
 
     @property
     def bodies(self) -> np.ndarray:
-        """int32 [K]: of each box the object that can be pushed, 0 for what stays: also things that stand partly in something."""
+        """int32 [K]: the movable object that each box belongs to; 0 for fixed boxes, and for objects that overlap others."""
         boxes, solid = self.boxes, np.asarray(self.solid)
-        found = np.array([one if one in self.movable else 0 for one in self.objects], np.int32)
+        owner = np.array([one if one in self.movable else 0 for one in self.objects], np.int32)
         for number in sorted(self.movable):
-            mine = found == number
+            mine = owner == number
             other = boxes[~mine & solid]
             shared = np.minimum(boxes[mine, None, 3:], other[:, 3:]) - np.maximum(boxes[mine, None, :3], other[:, :3])
             if (shared > INSIDE_M).all(2).any():
-                found[mine] = 0
-        return found
+                owner[mine] = 0
+        return owner
 
 
 def blocks_of(plan: RoomLayout) -> Blocks:
-    """Everything in a plan; ContractError for what does not fit."""
+    """The blocks of a layout; ContractError for parts that do not fit."""
     blocks = Blocks()
     holes: dict[tuple[str, str], list[tuple[float, float, float, float]]] = {}
     for door in plan.doors:
@@ -91,7 +90,7 @@ def blocks_of(plan: RoomLayout) -> Blocks:
 
 
 class _Wall:
-    """Boxes of a wall in its own numbers: along it, outwards from the room, and height."""
+    """A wall with its own coordinates: along it, outwards from the room, and height."""
 
     def __init__(self, room: Room, wall: str):
         self.axis, upper = WALLS[wall]
@@ -131,7 +130,7 @@ def _room(blocks: Blocks, room: Room, holes: dict, bright: bool) -> None:
 
 
 def _spread(room: Room, count: int) -> list[tuple[float, float]]:
-    """`count` places or a few more in rows and columns over a room."""
+    """`count` points or a few more, in rows and columns over a room."""
     if not count:
         return []
     across = max(round(math.sqrt(count * room.size[0] / room.size[1])), 1)
@@ -144,7 +143,7 @@ def _spread(room: Room, count: int) -> list[tuple[float, float]]:
 
 
 def _without(rect: tuple[float, ...], hole: tuple[float, ...]) -> list[tuple[float, float, float, float]]:
-    """What a hole leaves of a rectangle (both: from, to, lower, upper)."""
+    """The parts of a rectangle around a hole (both: from, to, lower, upper)."""
     a0, a1, z0, z1 = rect
     h0, h1, l0, l1 = max(hole[0], a0), min(hole[1], a1), max(hole[2], z0), min(hole[3], z1)
     if h0 >= h1 or l0 >= l1:
@@ -188,7 +187,7 @@ def _door(blocks: Blocks, plan: RoomLayout, door: Door, holes: dict) -> None:
 def _beyond(
     plan: RoomLayout, room: Room, door: Door, wall: _Wall, span: tuple[float, float]
 ) -> tuple[Room | None, float]:
-    """The room that a door leads to, and how far it is; none where nothing is behind the wall."""
+    """The room that a door leads to, and its distance; None if there is none behind the wall."""
     for other in plan.rooms:
         near = other.low[wall.axis] if wall.out > 0 else other.high[wall.axis]
         gap, k = wall.out * (near - wall.face), 1 - wall.axis
@@ -258,7 +257,7 @@ def _thing(blocks: Blocks, plan: RoomLayout, thing: Thing) -> None:
     if kind.movable if thing.movable is None else thing.movable:
         blocks.movable.add(number)
     own = look_of(thing.look, look_of(kind.look).material) if thing.look else look_of(kind.look)
-    for x0, y0, z0, x1, y1, z1, said in kind.parts:
+    for x0, y0, z0, x1, y1, z1, words in kind.parts:
         corners = [((x - 0.5) * width, (y - 0.5) * depth) for x, y in ((x0, y0), (x1, y1))]
         for _ in range(turns):
             corners = [(-y, x) for x, y in corners]
@@ -267,7 +266,7 @@ def _thing(blocks: Blocks, plan: RoomLayout, thing: Thing) -> None:
         blocks.add(
             (at[0] + min(ax, bx), at[1] + min(ay, by), at[2] + z0 * height),
             (at[0] + max(ax, bx), at[1] + max(ay, by), at[2] + z1 * height),
-            look_of(said) if said else own,
+            look_of(words) if words else own,
             number,
             not kind.soft,
         )

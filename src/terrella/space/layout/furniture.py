@@ -1,29 +1,27 @@
-"""Furniture as boxes: each kind's usual size, look and parts, where it stands, and whether bodies meet it."""
+"""Furniture made of boxes: the usual size, look and parts of each kind, where it stands, and whether it stops walkers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-Part = tuple[
-    float, float, float, float, float, float, str
-]  # corners in shares of width, depth and height; a look, "" for the thing's
+# Corners in shares of width, depth and height; a look, "" for that of the whole.
+Part = tuple[float, float, float, float, float, float, str]
 
 
 @dataclass(frozen=True)
 class Kind:
-    """size: width, depth, height in metres, its front to the south; look; stands: wall, middle, corner, any or hung (at a wall);
-    parts: by default one box; soft: bodies go through it; movable: it can be pushed."""
+    """A kind of furniture."""
 
-    size: tuple[float, float, float]
+    size: tuple[float, float, float]  # width, depth and height in metres, with its front to the south
     look: str
-    stands: str = "any"
+    stands: str = "any"  # wall, middle, corner, any or hung (on a wall)
     parts: tuple[Part, ...] = ((0, 0, 0, 1, 1, 1, ""),)
-    soft: bool = False
-    movable: bool = False
+    soft: bool = False  # walkers pass through it
+    movable: bool = False  # it can be pushed
 
 
 def _legs(top: float, thick: float, look: str = "") -> tuple[Part, ...]:
-    """Four legs up to `top`, `thick` in shares of the width and the depth."""
+    """Four legs of height `top`; `thick` is a share of the width and the depth."""
     ends = ((0.02, 0.02 + thick), (0.98 - thick, 0.98))
     return tuple((a, c, 0, b, d, top, look) for a, b in ends for c, d in ends)
 
@@ -120,6 +118,6 @@ SAME = {
 
 
 def kind_of(label: str) -> Kind:
-    """The kind that a label names; a plain box for any other word."""
+    """The kind of furniture of a label; a plain box for unknown words."""
     word = label.lower().strip()
     return KINDS.get(SAME.get(word, word), Kind((0.6, 0.6, 0.6), "paint"))

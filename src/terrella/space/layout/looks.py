@@ -1,4 +1,4 @@
-"""Looks: "dark red planks" as a material, a colour, and the pattern that it paints on a surface."""
+"""Looks: "dark red planks" as a material, a colour and a procedural texture."""
 
 from __future__ import annotations
 
@@ -14,12 +14,16 @@ COLOURS = {
     "yellow": "e3b53a", "green": "4f8a4a", "blue": "2f5d9e", "purple": "6d4a8f", "pink": "d98ca0", "brown": "6f4a30",
     "beige": "d9c6a3", "cream": "efe3c8", "turquoise": "3f9a97", "golden": "c9a13b", "navy": "22335c", "teal": "2b7073",
 }  # fmt: skip
-MATERIALS = {  # the colour that each has where none is said
+MATERIALS = {  # each with its default colour
     "plaster": "ebe4d6", "paint": "e6e2d8", "planks": "9c7148", "wood": "8a5a34", "tiles": "d5d2c9", "brick": "9a5440",
     "stone": "9b968c", "concrete": "a3a19b", "marble": "e4e0da", "carpet": "7c6a72", "cloth": "6d7f8e", "metal": "8f949a",
     "leaves": "4c7a3c", "grass": "5f8a3d", "books": "8a6a4a", "glass": "dfeaf2", "sky": "bcd6f2", "lamp": "fff0d2",
 }  # fmt: skip
-GLOWING = {"glass": 5.0, "sky": 3.0, "lamp": 16.0}  # what shines, and how brightly beside a white wall in the open
+GLOWING = {
+    "glass": 5.0,
+    "sky": 3.0,
+    "lamp": 16.0,
+}  # light sources, and their brightness relative to a white wall outdoors
 FINE = {
     "planks": 1.6,
     "tiles": 2.0,
@@ -39,10 +43,10 @@ WORDS = {*COLOURS, *MATERIALS, *_SHADES, *_SAME}
 
 @dataclass(frozen=True)
 class Look:
-    """material, a key of MATERIALS; colour, red green blue in 0..1 as screens have them."""
+    """A material with a colour."""
 
-    material: str
-    colour: tuple[float, float, float]
+    material: str  # a key of MATERIALS
+    colour: tuple[float, float, float]  # sRGB in 0..1
 
     @property
     def glow(self) -> float:
@@ -50,7 +54,7 @@ class Look:
 
 
 def look_of(words: str, usual: str = "paint") -> Look:
-    """The look that words name; ContractError for a word that none of COLOURS, MATERIALS and shades is, nor #rrggbb."""
+    """The look that words name; ContractError for an unknown word. Known are COLOURS, MATERIALS, shades and #rrggbb."""
     material, colour, shade = usual, "", 1.0
     for word in str(words).lower().replace(",", " ").split():
         word = _SAME.get(word, word)
@@ -73,7 +77,7 @@ def look_of(words: str, usual: str = "paint") -> Look:
 
 
 def texture_colours(look: Look, u: np.ndarray, v: np.ndarray, step: float, seed: int) -> np.ndarray:
-    """Colours [N, 3] of a surface at places u, v [N] metres, the mean over little squares of side `step`."""
+    """Colours [N, 3] of a surface at u, v [N] in metres, averaged over squares of side `step`."""
     pattern, offsets = _PATTERNS.get(look.material), (-step / 4, step / 4)
     shade = np.ones(len(u))
     if pattern is not None and look.material not in _SEAMS:

@@ -1,4 +1,4 @@
-"""Light on a scene of triangles: what its lamps, the sun and what glows see is lit by them (shadow maps, Williams 1978)."""
+"""Light on a scene of triangles from lamps, the sun and emissive surfaces, with shadow maps (Williams 1978)."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _USUAL = np.array([0.36, 0.48, 0.8])  # the direction that is brightest where th
 def falling(
     lights: Sequence[Light], gaussians: Gaussians, normals: np.ndarray, areas: np.ndarray, glow: np.ndarray
 ) -> np.ndarray:
-    """How much light falls on the sides of flat Gaussians that are seen: [N, 3]; normals [N, 3], areas [N] (square metres), and
-    how they glow [N, 3]. Without any light: brighter where they look up or down."""
+    """Irradiance of the visible sides of flat Gaussians [N, 3]; normals [N, 3], areas [N] (square metres), emission `glow` [N, 3].
+    Without any light, surfaces that face up or down are brighter."""
     glowing = _glowing(gaussians.means.numpy(), normals, areas, glow)
     if not lights and not glowing:
         return np.repeat(0.6 + 0.4 * np.abs(normals @ _USUAL)[:, None], 3, 1)
@@ -53,7 +53,7 @@ def falling(
 def _glowing(
     places: np.ndarray, normals: np.ndarray, areas: np.ndarray, glow: np.ndarray
 ) -> list[tuple[Light, np.ndarray]]:
-    """Lamps that stand for all that glows, and the way that each shines; evenly over what it sends."""
+    """Lamps that approximate all emissive surfaces, and their directions, sampled by power."""
     weight = areas * glow.sum(1)
     if not weight.sum() > 0:
         return []
@@ -66,7 +66,7 @@ def _glowing(
 
 
 def _sunlit(gaussians: Gaussians, towards: np.ndarray) -> np.ndarray:
-    """Which Gaussians a sun that shines that way reaches: bool [N]."""
+    """Whether sunlight from this direction reaches each Gaussian: bool [N]."""
     low, high = gaussians.means.amin(0), gaussians.means.amax(0)
     middle, radius = (low + high) / 2, float((high - low).norm() / 2 + 0.1)
     ahead = torch.from_numpy(np.ascontiguousarray(towards)).float()

@@ -1,4 +1,4 @@
-"""What stops bodies in a scene of triangles, as upright boxes: those that the scene is made of, and small ones around all else."""
+"""The collider of a scene of triangles as axis-aligned boxes: the scene's own boxes, and small ones around all other triangles."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _WIDEST = 1 << 18  # cells along an axis
 
 
 def solids_of(corners: np.ndarray, things: np.ndarray) -> np.ndarray | None:
-    """Boxes float32 [S, 6], low and high corners, of triangles [F, 3, 3] (metres) that belong to things [F]: a thing that is an
-    upright box is filled, unless other things lie in it (a room); of all else what lies in each cell of CELL_M. None for more
-    than MOST."""
+    """Boxes float32 [S, 6], low and high corners, of triangles [F, 3, 3] (metres) of the objects `things` [F]. An object that is a
+    box is filled, unless others lie in it (a room); the other triangles are boxed in each cell of CELL_M. None for more than
+    MOST boxes."""
     order = np.argsort(things, kind="stable")
     ends = np.flatnonzero(np.diff(things[order], prepend=-1, append=-1))
     groups = [order[a:b] for a, b in zip(ends, ends[1:])]
@@ -29,12 +29,12 @@ def solids_of(corners: np.ndarray, things: np.ndarray) -> np.ndarray | None:
     boxes = [spans[whole]] if whole else []
     if others.any():
         boxes.append(_cells(corners[others].astype(np.float64)))
-    found = np.concatenate(boxes)
-    return found.astype(np.float32) if len(found) <= MOST else None
+    merged = np.concatenate(boxes)
+    return merged.astype(np.float32) if len(merged) <= MOST else None
 
 
 def _is_box(corners: np.ndarray, span: np.ndarray) -> bool:
-    """Whether 12 triangles [12, 3, 3] that look outwards are the upright box of their limits [6]."""
+    """Whether 12 triangles [12, 3, 3] that face outwards form the box `span` [6]."""
     low, size = span[:3], span[3:] - span[:3]
     share = (corners - low) / np.maximum(size, 1e-9)
     volume = np.einsum("ij,ij->", share[:, 0], np.cross(share[:, 1], share[:, 2])) / 6
@@ -46,7 +46,7 @@ def _holds(span: np.ndarray, others: np.ndarray) -> bool:
 
 
 def _cells(corners: np.ndarray) -> np.ndarray:
-    """Boxes [K, 6] around what lies in each cell, apart for what looks along x, y and z: flat ones for upright and level walls."""
+    """Boxes [K, 6] around the triangles in each cell, separate for normals along x, y and z, so that walls get flat boxes."""
     small, _ = pieces(corners, MOST_PIECES, CELL_M)
     low, high = small.min(1), small.max(1)
     cell = max(CELL_M, (high - low).max(), (high.max(0) - low.min(0)).max() / _WIDEST)
@@ -62,14 +62,14 @@ def _cells(corners: np.ndarray) -> np.ndarray:
         parts.append(inside[kept])
     boxes, key = np.concatenate(parts), np.concatenate(keys)
     order = np.argsort(key, kind="stable")
-    found = _joined(boxes[order], np.diff(key[order], prepend=-1) != 0)
+    merged = _joined(boxes[order], np.diff(key[order], prepend=-1) != 0)
     for along in (0, 1, 2):
-        found = _merged(found, along)
-    return found
+        merged = _merged(merged, along)
+    return merged
 
 
 def _merged(boxes: np.ndarray, along: int) -> np.ndarray:
-    """Boxes that follow one another along an axis, and are as wide along the others, in one."""
+    """Merges adjacent boxes along an axis that have the same extent along the others."""
     rest = [k for k in range(6) if k % 3 != along]
     wide = np.round(boxes[:, rest] / _SAME_M).astype(np.int64)
     order = np.lexsort((boxes[:, along], *wide.T))
@@ -80,6 +80,6 @@ def _merged(boxes: np.ndarray, along: int) -> np.ndarray:
 
 
 def _joined(boxes: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """The limits of each run of boxes; `first` [N] says where one begins."""
+    """The bounding box of each run of boxes; `first` [N] marks where one begins."""
     starts = np.flatnonzero(first)
     return np.concatenate([np.minimum.reduceat(boxes[:, :3], starts), np.maximum.reduceat(boxes[:, 3:], starts)], 1)

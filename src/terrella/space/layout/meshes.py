@@ -1,4 +1,4 @@
-"""A scene of triangles as a place to walk in: flat Gaussians on pieces of them, lit, and boxes that stop bodies."""
+"""A scene of triangles as a place to walk in: flat lit Gaussians on pieces of triangles, and boxes that stop walkers."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _SEEN = 0.02  # opacity
 
 
 def of_triangles(scene: GltfScene, count: int = 120_000) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
-    """Gaussians, about `count` and at least one a triangle; int32 [N], which thing of the scene each belongs to; and boxes
-    float32 [S, 6] that stop bodies, None where they would be too many: then what the Gaussians fill stops them."""
+    """Gaussians, about `count` and at least one per triangle; int32 [N], the object of each; and boxes float32 [S, 6] that stop
+    walkers, or None if there would be too many: then an occupancy grid is used."""
     corners, face = pieces(scene.corners, count, 2 * FINEST_M)
     colours, opacities, glow, unlit = _surface(scene, corners, face)
     kept = opacities > _SEEN
@@ -45,7 +45,7 @@ def of_triangles(scene: GltfScene, count: int = 120_000) -> tuple[Gaussians, tor
 def _surface(
     scene: GltfScene, corners: np.ndarray, face: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of each piece its colour and its opacity, its glow (all linear) and whether its colour holds its light."""
+    """Colour, opacity and emission of each piece (all linear), and whether it is unlit."""
     tint, glow = corners[..., 3:7].mean(1), np.zeros((len(face), 3), np.float32)
     unlit, which = np.zeros(len(face), np.bool_), scene.material[face]
     for k, material in enumerate(scene.materials):
@@ -57,9 +57,9 @@ def _surface(
             u, v = np.moveaxis(_INNER.astype(np.float32) @ corners[rows, :, 7:9], -1, 0)
             u, v = u * material.placed[0] + material.placed[2], v * material.placed[1] + material.placed[3]
             at = ((np.nan_to_num(part) % 1 * side).astype(int) % side for part, side in ((v, height), (u, width)))
-            found = (material.picture[tuple(at)] / np.float32(255)).astype(np.float32)
-            found[..., :3] **= 2.2
-            tint[rows] *= found.mean(1)
+            texels = (material.picture[tuple(at)] / np.float32(255)).astype(np.float32)
+            texels[..., :3] **= 2.2
+            tint[rows] *= texels.mean(1)
         if material.cut:
             tint[rows, 3] = tint[rows, 3] >= material.cut
         elif not material.see_through:
@@ -69,7 +69,7 @@ def _surface(
 
 
 def _flat(corners: np.ndarray, normals: np.ndarray, opacities: np.ndarray) -> Gaussians:
-    """A grey Gaussian a triangle [P, 3, 3], as wide along its plane as the triangle is."""
+    """A grey Gaussian for each triangle [P, 3, 3], with its extent in the plane."""
     places, way = torch.from_numpy(corners).float(), torch.from_numpy(normals).float()
     middle = places.mean(1)
     up = torch.where(way[:, 2:] < 0, -way, way)

@@ -6,8 +6,11 @@ import numpy as np
 
 
 def pieces(corners: np.ndarray, count: int, finest_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners [F, 3, k], of which the first three numbers are a place (metres), with the longest edges halved until there are
-    `count` or none is longer than `finest_m`; and of which triangle each piece is. All k numbers go evenly along edges."""
+    """Splits triangles until there are `count`, or until no edge is longer than `finest_m`, the longest edges first.
+
+    corners [F, 3, k]: the first three numbers are a point (metres); all k are interpolated along edges. Returns the corners of
+    the pieces, and the triangle that each belongs to.
+    """
     corners, face = corners.copy(), np.arange(len(corners))
     while len(corners) < count:
         edges = np.linalg.norm(corners[:, [1, 2, 0], :3] - corners[:, :, :3], axis=2)

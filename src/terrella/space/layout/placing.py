@@ -1,4 +1,4 @@
-"""Where things stand in a room that words describe: by walls, in corners, around tables; chance only where words leave a choice."""
+"""Places things in a room that was described in words: at walls, in corners, around tables; at random where words leave it open."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class FurnitureRequest(Protocol):
 
 
 def furnish_room(
-    layout: dict[str, Any], number: int, asked: Sequence[FurnitureRequest], following: bool, seed: int
+    layout: dict[str, Any], number: int, requests: Sequence[FurnitureRequest], following: bool, seed: int
 ) -> list[str]:
-    """Puts what is asked for into room `number` of a layout, and a door to the next room; what found no place."""
+    """Adds the requested things to room `number` of a layout, and a door to the next room. Returns the labels without a place."""
     room = layout["rooms"][number]
-    return _Room(layout, room, random.Random(1000 * seed + number)).fill(asked, number > 0, following)
+    return _Room(layout, room, random.Random(1000 * seed + number)).fill(requests, number > 0, following)
 
 
 class _Room:
@@ -46,16 +46,16 @@ class _Room:
         self.clear: list[Rect] = []  # where nothing may
         self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
 
-    def fill(self, asked: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
-        """Openings first, then what is largest."""
+    def fill(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
+        """Openings first, then the largest things."""
         middle = (self.y0 + self.y1) / 2
         if entered:
             self.clear.append((self.x0, middle - 0.6, self.x0 + CLEAR_M + 0.2, middle + 0.6))
         else:
             self.clear.append((self.x0, middle - 0.5, self.x0 + 1.4, middle + 0.5))  # where one begins
-        lost = self._openings([one for one in asked if one.label in ("door", "window")], entered, following)
+        lost = self._openings([one for one in requests if one.label in ("door", "window")], entered, following)
         order = {"stairs": 0, "pillar": 1, "middle": 2, "wall": 3, "corner": 4, "hung": 5, "any": 6}
-        rest = [one for one in asked if one.label not in ("door", "window")]
+        rest = [one for one in requests if one.label not in ("door", "window")]
         rest.sort(
             key=lambda one: order.get(one.label, order[kind_of(one.label).stands if one.label != "stairs" else "wall"])
         )
@@ -65,15 +65,15 @@ class _Room:
                 lost.append(f"{one.count - done} {one.label}")
         return lost
 
-    def _openings(self, asked: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
-        """Doors and windows, spread evenly over each wall; those for which it is too short."""
+    def _openings(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
+        """Adds doors and windows, spread evenly over each wall; returns those for which it is too short."""
         on: dict[str, list[FurnitureRequest]] = {side: [] for side in _SIDES}
-        joined = [side for side, there in (("east", following), ("west", entered)) if there]
+        joined = [side for side, present in (("east", following), ("west", entered)) if present]
         free = [side for side in ("east", "north", "south", "west") if side not in joined]
         first = following
         if following:
-            self._door("east", None, next((one.look for one in asked if one.label == "door"), ""))
-        for one in asked:
+            self._door("east", None, next((one.look for one in requests if one.label == "door"), ""))
+        for one in requests:
             count = one.count - (first and one.label == "door")
             first = first and one.label != "door"
             for k in range(count):
@@ -119,7 +119,7 @@ class _Room:
         )
 
     def _before(self, side: str, low: float, high: float, deep: float) -> Rect:
-        """The floor before a part of a wall."""
+        """The floor in front of a part of a wall."""
         if side in ("east", "west"):
             a = (self.x1 - deep, self.x1) if side == "east" else (self.x0, self.x0 + deep)
             return (a[0], self.y0 + low, a[1], self.y0 + high)
@@ -127,7 +127,7 @@ class _Room:
         return (self.x0 + low, b[0], self.x0 + high, b[1])
 
     def _place(self, one: FurnitureRequest) -> int:
-        """How many of them found a place."""
+        """How many of them could be placed."""
         if one.label == "stairs":
             return sum(self._stairs(one) for _ in range(one.count))
         kind, done = kind_of(one.label), 0
@@ -138,14 +138,14 @@ class _Room:
         for k in range(one.count):
             ways = [*spots[k : k + 1], *self._spots(one, kind.stands, size)]
             for margin in (APART_M, 0.25, 0.02):
-                found = next(
+                spot = next(
                     (spot for spot in ways if self._free(self._rect(spot, size), margin, kind.soft, one.label)), None
                 )
-                if found:
+                if spot:
                     break
-            if not found:
+            if not spot:
                 break
-            self._put(one, kind, size, found)
+            self._put(one, kind, size, spot)
             done += 1
         return done
 
@@ -182,7 +182,7 @@ class _Room:
         )
 
     def _row(self, count: int, size) -> list[tuple[float, float, str]]:
-        """In the middle, one after the other along the room; pillars in pairs."""
+        """Adds things in the middle, one after the other along the room; pillars in pairs."""
         pairs = size[2] > 2 and count % 2 == 0
         many = count // 2 if pairs else count
         places = []
@@ -193,7 +193,7 @@ class _Room:
         return places
 
     def _spots(self, one: FurnitureRequest, stands: str, size) -> Iterator[tuple[float, float, str]]:
-        """Where such a thing may stand, the best first."""
+        """Candidate positions of a thing, the best first."""
         if one.label == "chair":
             for _, seats in self.tables:
                 yield from list(seats)
@@ -214,7 +214,7 @@ class _Room:
                 yield (x, y, self.rng.choice(_SIDES))
 
     def _along(self, side: str, size, hung: bool) -> Iterator[tuple[float, float, str]]:
-        """Places at a wall, from its middle outwards, not before its windows where they would hide them."""
+        """Positions at a wall, from its middle outwards, not in front of windows that they would hide."""
         length, deep = self._length(side), size[1] / 2
         blocked = [
             (one["at"] - one["width"] / 2, one["at"] + one["width"] / 2)
@@ -232,7 +232,7 @@ class _Room:
             yield (x, y, _FRONT[side])
 
     def _seats(self, rect: Rect, label: str, facing: str) -> list[tuple[float, float, str]]:
-        """Where chairs stand around a table: along its longer sides, then at its ends; at a desk before its front."""
+        """Positions of chairs around a table: along its longer sides, then at its ends; at a desk only in front."""
         x0, y0, x1, y1 = rect
         x, y, off = (x0 + x1) / 2, (y0 + y1) / 2, 0.12
         if label == "desk":
@@ -249,7 +249,7 @@ class _Room:
         ]
 
     def _stairs(self, one: FurnitureRequest) -> bool:
-        """Stairs along a wall that rise to the east, up to a platform."""
+        """Adds stairs along a wall that rise to the east, up to a platform."""
         (long, wide, high), landing = _STAIRS_M, _LANDING_M
         sides = [one.side] if one.side in ("north", "south") else ["north", "south"]
         for side in sides:

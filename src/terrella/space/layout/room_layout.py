@@ -1,4 +1,4 @@
-"""The plan of a place, as a layout.json says it: rooms, doors, windows, stairs, things. Checked whole before anything is built.
+"""The layout of a place, as in a layout.json: rooms, doors, windows, stairs, things. It is checked before anything is built.
 
 World frame, metres: x east, y north, z up. Walls are 0.1 m thick and lie outside a room's own space.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +16,22 @@ from ...core.errors import ContractError
 from .looks import look_of
 
 WALL_M = 0.1
-REACH_M = 0.5  # a door reaches a room that lies at most so far behind its wall
+REACH_M = 0.5  # a door leads to a room at most this far behind its wall
 WALLS = {"east": (0, 1), "west": (0, 0), "north": (1, 1), "south": (1, 0)}  # axis, and whether at its upper end
 MOST_M, MOST_AREA_M2, MOST_THINGS = 60.0, 2000.0, 400
 
 
 @dataclass(frozen=True)
 class Room:
-    """at: its corner with the least x and y, and the height of its floor; size: along x, y and z; looks; lamps: panels of light at
-    the ceiling, by default as many as its size asks for where it has no window."""
+    """A box with a floor, four walls and a ceiling, each with a look (looks.py)."""
 
     name: str
-    at: tuple[float, float, float]
-    size: tuple[float, float, float]
+    at: tuple[float, float, float]  # its corner with the least x and y, and the height of its floor
+    size: tuple[float, float, float]  # along x, y and z
     floor: str = "planks"
     walls: str = "plaster"
     ceiling: str = "white plaster"
-    lamps: int | None = None
+    lamps: int | None = None  # light panels at the ceiling; default: by its size, fewer with windows
 
     @property
     def low(self) -> tuple[float, float, float]:
@@ -45,12 +44,11 @@ class Room:
 
 @dataclass(frozen=True)
 class Door:
-    """In a wall of a room, its middle `at` metres from the wall's western or southern end (by default in the middle); one that
-    leads to another room is open, one that leads nowhere is shut."""
+    """A door in a wall of a room. It is open if it leads to another room, else shut."""
 
     room: str
     wall: str
-    at: float | None = None
+    at: float | None = None  # metres from the wall's western or southern end to its middle; default: the wall's middle
     width: float = 0.95
     height: float = 2.1
     look: str = "wood"
@@ -58,7 +56,7 @@ class Door:
 
 @dataclass(frozen=True)
 class Window:
-    """As a door, `sill` metres above the floor."""
+    """Like a door, but `sill` metres above the floor."""
 
     room: str
     wall: str
@@ -71,7 +69,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Stairs:
-    """Steps that fill a box from its corner `at`, rising towards `up` to its full height."""
+    """Steps that fill a box with the corner `at` and rise towards `up`."""
 
     at: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -82,33 +80,29 @@ class Stairs:
 
 @dataclass(frozen=True)
 class Thing:
-    """What stands in a room: `label` a kind of furniture (furniture.py), or any other word for a plain box. at: the middle of
-    its foot; size: along x, y and z as it would face south; facing: where its front looks; movable: whether it can be pushed, by
-    default as its kind."""
+    """An object in a room."""
 
-    label: str
-    at: tuple[float, float, float]
-    size: tuple[float, float, float] | None = None
+    label: str  # a kind of furniture (furniture.py), or any other word for a plain box
+    at: tuple[float, float, float]  # the middle of its foot
+    size: tuple[float, float, float] | None = None  # along x, y and z if it faced south
     facing: str = "south"
     look: str | None = None
-    movable: bool | None = None
+    movable: bool | None = None  # whether it can be pushed; default: as its kind
 
 
 @dataclass(frozen=True)
 class RoomLayout:
-    """A whole place; start: x, y and the heading in degrees (0 east, 90 north) where one begins."""
+    """A whole place."""
 
     rooms: tuple[Room, ...]
     doors: tuple[Door, ...] = ()
     windows: tuple[Window, ...] = ()
     stairs: tuple[Stairs, ...] = ()
     things: tuple[Thing, ...] = ()
-    start: tuple[float, float, float] | None = None
+    start: tuple[float, float, float] | None = None  # x, y and heading in degrees (0 east, 90 north)
     name: str = "place"
     seed: int = 0
-    sun: tuple[float, float] | None = field(
-        default=(215.0, 42.0)
-    )  # where it stands: compass-like heading and height, degrees
+    sun: tuple[float, float] | None = (215.0, 42.0)  # its heading and its height above the horizon, degrees
 
     def __post_init__(self):
         check(self)
@@ -118,20 +112,20 @@ _PARTS = {"rooms": Room, "doors": Door, "windows": Window, "stairs": Stairs, "th
 
 
 def read_layout(source: str | Path | Mapping[str, Any]) -> RoomLayout:
-    """The plan in a file of JSON, or in what such a file says. ContractError names what is wrong with it."""
+    """The layout in a file of JSON, or in its content. ContractError says what is wrong with it."""
     if isinstance(source, Mapping):
-        said: Any = source
+        content: Any = source
     else:
         try:
-            said = json.loads(Path(source).read_text())
+            content = json.loads(Path(source).read_text())
         except OSError as error:
             raise ContractError(f"{source} cannot be read ({error.strerror}); give a layout.json.") from error
         except ValueError as error:
-            raise ContractError(f"{source} is no JSON ({error}); docs/space.md shows what a layout says.") from error
-    if not isinstance(said, Mapping):
+            raise ContractError(f"{source} is no JSON ({error}); docs/space.md shows a layout.") from error
+    if not isinstance(content, Mapping):
         raise ContractError("a layout is an object of JSON with `rooms`.")
     given: dict[str, Any] = {}
-    for name, value in said.items():
+    for name, value in content.items():
         if name in _PARTS:
             if not isinstance(value, Sequence) or isinstance(value, str):
                 raise ContractError(f"`{name}` of a layout is a list.")
@@ -141,17 +135,17 @@ def read_layout(source: str | Path | Mapping[str, Any]) -> RoomLayout:
     return _read(RoomLayout, given, "the layout")
 
 
-def _read(kind: type, said: Any, where: str) -> Any:
-    """A dataclass of what JSON says; ContractError for fields that it lacks or does not know, and values of another kind."""
-    if not isinstance(said, Mapping):
-        raise ContractError(f"{where} is an object; got {said!r:.60}.")
+def _read(kind: type, content: Any, where: str) -> Any:
+    """A dataclass from a JSON object; ContractError for missing and unknown fields, and for values of another type."""
+    if not isinstance(content, Mapping):
+        raise ContractError(f"{where} is an object; got {content!r:.60}.")
     known = {one.name: one for one in fields(kind)}
-    unknown = [str(name) for name in said if name not in known]
-    missing = [name for name, one in known.items() if one.default is MISSING and name not in said]
+    unknown = [str(name) for name in content if name not in known]
+    missing = [name for name, one in known.items() if one.default is MISSING and name not in content]
     if unknown or missing:
         what = f"has the unknown field '{unknown[0]:.40}'" if unknown else f"lacks '{missing[0]}'"
         raise ContractError(f"{where} {what}; its fields are {', '.join(known)}.")
-    return kind(**{name: _value(value, str(known[name].type), f"{where}.{name}") for name, value in said.items()})
+    return kind(**{name: _value(value, str(known[name].type), f"{where}.{name}") for name, value in content.items()})
 
 
 def _finite(value: object) -> bool:
@@ -183,7 +177,7 @@ def _value(value: Any, kind: str, where: str) -> Any:
 
 
 def check(plan: RoomLayout) -> None:
-    """Refuses, in a sentence of ContractError, what cannot be built."""
+    """ContractError for a layout that cannot be built."""
     if not plan.rooms:
         raise ContractError("a layout has at least one room.")
     names = [room.name for room in plan.rooms]
@@ -211,13 +205,13 @@ def check(plan: RoomLayout) -> None:
             _sizes(thing.size, f"the {thing.label}", 0.01)
         facing = thing.up if isinstance(thing, Stairs) else thing.facing
         if facing not in WALLS:
-            raise ContractError(f"the {thing.label} looks '{facing}'; ways are {', '.join(WALLS)}.")
+            raise ContractError(f"the {thing.label} faces '{facing}'; directions are {', '.join(WALLS)}.")
     if plan.start is not None and room_at(plan, (*plan.start[:2], plan.rooms[0].at[2] + 0.5)) is None:
         raise ContractError(f"the start {list(plan.start)} lies in no room.")
 
 
 def room_at(plan: RoomLayout, place: Sequence[float]) -> Room | None:
-    """The room in which a place [3] is."""
+    """The room that contains a point [3]."""
     for room in plan.rooms:
         if all(room.low[k] - 1e-6 <= place[k] <= room.high[k] + 1e-6 for k in range(3)):
             return room

@@ -1,9 +1,9 @@
-"""Words as a plan: "a long room with two pillars and a red door". A small grammar, no language model; docs/space.md shows it.
+"""Parses words into a layout: "a long room with two pillars and a red door". A small grammar, no language model; see docs/space.md.
 
     text    = room { room };  room = { size | look } NOUN { thing | surface };  thing = [number] { size | look } NOUN { place }
     surface = { look } ("floor" | "walls" | "ceiling");  place = ("on" | "in" | "at" | "by") ... SIDE
 
-Rooms follow one another to the east, joined by doors. Words that mean nothing here are given back.
+Rooms follow one another to the east, joined by doors. Unknown words are reported.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MOST_EACH = 24
 
 @dataclass
 class _ItemText:
-    """A thing asked for: how many, of which kind, which look, how large beside the usual, and where."""
+    """A thing in the text: its kind, how many, its look, its size relative to the usual, and where."""
 
     label: str
     count: int
@@ -103,25 +103,25 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
         "things": [],
     }
     x, names = 0.0, []
-    for asked in rooms:
-        about = {**ROOMS[asked.kind], **asked.looks}
-        size = [round(max(a * b, 1.6), 2) for a, b in zip(about.pop("size"), asked.scale)]
-        if any(one.label in ("stairs", "platform") for one in asked.things):
+    for room in rooms:
+        about = {**ROOMS[room.kind], **room.looks}
+        size = [round(max(a * b, 1.6), 2) for a, b in zip(about.pop("size"), room.scale)]
+        if any(one.label in ("stairs", "platform") for one in room.things):
             size[2] = max(size[2], 3.2)
-        names.append(asked.kind if asked.kind not in names else f"{asked.kind} {len(names) + 1}")
+        names.append(room.kind if room.kind not in names else f"{room.kind} {len(names) + 1}")
         layout["rooms"].append(
             {"name": names[-1], "at": [round(x, 2), round(-size[1] / 2, 2), 0.0], "size": size, **about}
         )
         x += size[0] + 0.12
     left_out: list[str] = []
-    for at, asked in enumerate(rooms):
+    for at, room in enumerate(rooms):
         following = at + 1 < len(rooms)
-        left_out += furnish_room(layout, at, asked.things, following, seed)
+        left_out += furnish_room(layout, at, room.things, following, seed)
     return ParsedText(read_layout(layout), layout, tuple(unknown), tuple(left_out))
 
 
 def _parsed(text: str) -> tuple[list[_RoomText], list[str]]:
-    """Rooms and what is in them; the words that were not understood."""
+    """The rooms with their things, and the words that were not understood."""
     rooms: list[_RoomText] = []
     unknown: list[str] = []
     words: list[str] = re.findall(r"[a-z0-9#]+", text.lower())[:400]

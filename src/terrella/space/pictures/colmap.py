@@ -39,21 +39,21 @@ def read_colmap(folder: Path) -> Shots:
     if model is None:
         raise DatasetError(f"{folder} has no model of COLMAP (sparse/0/cameras.bin); give the folder that holds one.")
     try:
-        found = colmap.Reconstruction(str(model))
+        model_data = colmap.Reconstruction(str(model))
     except (RuntimeError, ValueError, MemoryError) as error:
         raise DatasetError(f"{model} cannot be read as a model of COLMAP; make it again.") from error
-    lenses = {number: _lens(camera) for number, camera in found.cameras.items()}
+    lenses = {number: _lens(camera) for number, camera in model_data.cameras.items()}
     homes = [home for home in (folder / "images", folder, model.parent.parent / "images") if home.is_dir()]
-    placed = sorted((one for one in found.images.values() if one.has_pose), key=lambda one: one.name)
+    placed = sorted((one for one in model_data.images.values() if one.has_pose), key=lambda one: one.name)
     files, poses = [], []
     for image in placed:
         files.append(next((f for home in homes if (f := home / image.name).is_file()), homes[0] / image.name))
-        there = image.cam_from_world().inverse().matrix()
-        rot = np.stack([there[:, 2], -there[:, 0], -there[:, 1]], 1)
-        poses.append(pose_of(rot, there[:, 3], f"{model}: {image.name}"))
+        pose = image.cam_from_world().inverse().matrix()
+        rot = np.stack([pose[:, 2], -pose[:, 0], -pose[:, 1]], 1)
+        poses.append(pose_of(rot, pose[:, 3], f"{model}: {image.name}"))
     if not placed:
         raise DatasetError(f"{model} places no picture; make it again.")
-    points = np.array([point.xyz for point in found.points3D.values()], np.float32).reshape(-1, 3)
+    points = np.array([point.xyz for point in model_data.points3D.values()], np.float32).reshape(-1, 3)
     points = torch.from_numpy(points[np.isfinite(points).all(1)])
     return levelled(Shots(files, [lenses[one.camera_id] for one in placed], torch.stack(poses), points, False))
 
@@ -85,8 +85,8 @@ def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
     try:
         colmap.extract_features(database, images, camera_mode=cameras, extraction_options=features)
         (colmap.match_sequential if film and count > _MANY else colmap.match_exhaustive)(database)
-        found = colmap.incremental_mapping(database, images, work, options=plan)
-        best = max(found.values(), key=lambda one: one.num_reg_images()) if found else None
+        models = colmap.incremental_mapping(database, images, work, options=plan)
+        best = max(models.values(), key=lambda one: one.num_reg_images()) if models else None
         placed = best.num_reg_images() if best else 0
         if best is None or placed < 3:
             raise DatasetError(

@@ -71,7 +71,7 @@ def blurred(pictures_sharpness: list[float]) -> list[bool]:
 
 
 def video_pictures(path: Path, count: int, longest: int) -> list[np.ndarray]:
-    """`count` frames of a video at most, the sharpest of each of so many stretches of it: uint8 [H, W, 3] each."""
+    """At most `count` frames of a video, the sharpest of each of `count` equal parts of it: uint8 [H, W, 3] each."""
     import av
     from av.error import FFmpegError
 

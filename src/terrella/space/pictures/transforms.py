@@ -39,8 +39,8 @@ def read_transforms(path: Path) -> Shots:
             raise ValueError("it lists no frames")
         points = _points(path.parent / doc["ply_file_path"]) if "ply_file_path" in doc else torch.zeros(0, 3)
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
-        said = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise DatasetError(f"{path} cannot be read as posed pictures: {said}; write it again.") from error
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(f"{path} cannot be read as posed pictures: {reason}; write it again.") from error
     return Shots(files, lenses, torch.stack(poses), points, True)
 
 
@@ -52,19 +52,19 @@ def _file(folder: Path, name: str) -> Path:
     return next((one for end in ENDINGS if (one := file.with_name(file.name + end)).exists()), file)
 
 
-def _lens(said: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens]) -> Lens:
+def _lens(frame: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens]) -> Lens:
     """The lens of a frame; the same one for the same numbers."""
     names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
-    key = tuple(said.get(name) for name in names)
+    key = tuple(frame.get(name) for name in names)
     if key not in cameras:
-        model = str(said.get("camera_model", "OPENCV"))
+        model = str(frame.get("camera_model", "OPENCV"))
         if model not in _MODELS:
             raise ValueError(f"cameras of the model {model} are not known, only {', '.join(_MODELS)}")
-        height, width = (said["h"], said["w"]) if "w" in said and "h" in said else read_picture(file).shape[:2]
+        height, width = (frame["h"], frame["w"]) if "w" in frame and "h" in frame else read_picture(file).shape[:2]
         width, height = int(width), int(height)
-        fx = said["fl_x"] if "fl_x" in said else 0.5 * width / np.tan(0.5 * float(said["camera_angle_x"]))
-        focal = [float(v) for v in (fx, said.get("fl_y", fx), said.get("cx", width / 2), said.get("cy", height / 2))]
-        bend = {name: float(said.get(name) or 0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        fx = frame["fl_x"] if "fl_x" in frame else 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
+        focal = [float(v) for v in (fx, frame.get("fl_y", fx), frame.get("cx", width / 2), frame.get("cy", height / 2))]
+        bend = {name: float(frame.get(name) or 0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
         if min(width, height) < 8 or not all(map(np.isfinite, [*focal, *bend.values()])) or min(focal[:2]) <= 0:
             raise ValueError(f"the camera of {file.name} has no sensible size or focal length")
         fisheye = model == "OPENCV_FISHEYE"

@@ -51,8 +51,8 @@ def quaternion_of(rot: torch.Tensor) -> torch.Tensor:
         q = [m[n, j] - m[j, n], torch.tensor(0.0), torch.tensor(0.0), torch.tensor(0.0)]
         q[1 + i] = 1 + m[i, i] - m[j, j] - m[n, n]
         q[1 + j], q[1 + n] = m[i, j] + m[j, i], m[i, n] + m[n, i]
-    found = torch.stack([torch.as_tensor(part).double() for part in q])
-    return (found / found.norm()).float()
+    value = torch.stack([torch.as_tensor(part).double() for part in q])
+    return (value / value.norm()).float()
 
 
 def _turned_sh(sh: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:

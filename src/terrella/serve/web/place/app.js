@@ -103,8 +103,8 @@ function run({ drawing, source, story, solid: first }) {
   /** Draws beside the place another one, or itself as it was before its edits; or no more. */
   async function contrast() {
     if (compare.open) { compare.show(null); return; }
-    if (seen.stands > 1) { toast('The rest of the place comes first.'); return; }
-    if (!world.beside && !story.edits.length) { toast('It was not edited. `terrella space view PLACE --beside OTHER` compares it with another place or file.'); return; }
+    if (seen.stands > 1) { toast('Wait until the whole place is loaded.'); return; }
+    if (!world.beside && !story.edits.length) { toast('This place has no edits to compare. `terrella space view PLACE --beside OTHER` compares it with another place or file.'); return; }
     const other = (await beside()) ?? source;
     seen.sorted = '';
     compare.show(other, world.beside?.name ?? 'before its edits');
@@ -206,7 +206,7 @@ function run({ drawing, source, story, solid: first }) {
   setInterval(figures, 400);
   const merges = world.beside?.merge;
   $('merging').hidden = !merges;
-  $('merge').title = merges ? `All of ${world.beside.name}, turned by ° about its origin, then moved by x y z in metres` : '';
+  $('merge').title = merges ? `Adds all of ${world.beside.name}, turned by ° about its origin, then moved by x y z metres` : '';
   $('merge').onclick = async () => {
     const [x, y, z, degrees] = [...$('merging').querySelectorAll('input')].map((input) => Number(input.value));
     if (![x, y, z, degrees].every(Number.isFinite)) { toast('A merge takes metres and degrees, such as 1.25.'); return; }
@@ -231,15 +231,15 @@ function run({ drawing, source, story, solid: first }) {
   }
   if (drawing.remote) {
     for (const id of ['edit', 'tint', 'compared']) $(id).hidden = true;
-    toast(world.watch ? 'This browser has no WebGL2: watch the fit in one that has it.' : 'This browser has no WebGL2, so the server draws: walk as ever; editing needs a browser that has it.');
+    toast(world.watch ? 'This browser has no WebGL2; watch the fit in another one.' : 'This browser has no WebGL2, so the server draws. You can walk; editing needs WebGL2.');
   }
   if (world.watch) {
     $('making').hidden = false;
     $('edit').hidden = $('compared').hidden = true;
-    follow(world.watch, { newer, over: () => { $('making').hidden = true; toast('Nothing newer comes: the fit is done, or was stopped.'); } });
+    follow(world.watch, { newer, over: () => { $('making').hidden = true; toast('The fit is done, or was stopped.'); } });
   }
 
-  // the state of the page, for whoever drives it by a script
+  // the state of the page, for scripts
   window.terrella = {
     story, editor, drawing, walker, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
     get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
@@ -264,7 +264,7 @@ async function keep(lines, saved) {
   const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(new Blob([lines])), download: 'world.edits.jsonl' });
   anchor.click();
   setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
-  toast('Saved world.edits.jsonl: `terrella space edit PLACE --replay world.edits.jsonl` does the same to the place.');
+  toast('Saved world.edits.jsonl: `terrella space edit PLACE --replay world.edits.jsonl` applies it to the place.');
 }
 
 function greet() {

@@ -1,4 +1,4 @@
-// What stops bodies where a place's walls are known: upright boxes, met exactly, as space/solids.py has it.
+// The collider of a place whose walls are known: axis-aligned boxes, as in space/solids.py.
 
 import { slide } from './solid.js';
 

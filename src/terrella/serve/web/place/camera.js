@@ -1,4 +1,4 @@
-// The eye: its axes, its matrices, and rays through pixels. World: metres, z up; angles in radians, heading 0 looks along x.
+// The camera: its axes, its matrices, and rays through pixels. World: metres, z up; angles in radians, heading 0 looks along x.
 
 import { NEAR } from './draw.js';
 

@@ -1,4 +1,4 @@
-// Two places in one picture, from the same eye: what is compared with on the left of a line that one drags, the place on its right.
+// Two places in one picture, from the same camera: the other one to the left of a line that can be dragged, the place to its right.
 
 import { Drawing } from './draw.js';
 import { Sorter } from './sort.js';

@@ -1,5 +1,5 @@
-// Draws Gaussians with WebGL2: one quad each, the nearest first, as space/raster draws them. After each part of them, pixels through
-// which nothing more is seen are closed by the depth buffer, so that what lies behind costs nothing.
+// Draws Gaussians with WebGL2: one quad each, the nearest first, as space/raster draws them. After each part of them, opaque pixels
+// are closed by the depth buffer, so that hidden Gaussians cost nothing.
 
 import { FULL_SHADER, LINE_SHADERS, SHOW_SHADER, SPLAT_SHADERS, STOP_SHADER } from './shaders.js';
 
@@ -34,7 +34,7 @@ export class Drawing {
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
   }
 
-  /** Takes a scene: places, covariances and colours; each Gaussian stands for so many that are not there. */
+  /** Takes a scene: places, covariances and colours; each Gaussian represents others that were left out. */
   set(scene, stands = 1) {
     const { gl } = this, rows = Math.max(1, Math.ceil(scene.length / ACROSS)), data = new Uint32Array(rows * ACROSS * TEXELS * 4), floats = new Float32Array(data.buffer);
     for (let k = 0; k < scene.length; k += 1) {

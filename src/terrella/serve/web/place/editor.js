@@ -1,15 +1,15 @@
-// The editing panel: what is selected, what is done with it, and the edits so far.
+// The editing panel: the selection, the actions, and the edits so far.
 
-import { middleOf, select, told } from './edits.js';
+import { describe, middleOf, select } from './edits.js';
 import { Selecting } from './selecting.js';
 import { wiresOf } from './wires.js';
 
 const $ = (id) => document.getElementById(id);
 const NAMES = { box: ['x', 'y', 'z', 'to x', 'to y', 'to z'], sphere: ['x', 'y', 'z', 'r'], plane: ['a', 'b', 'c', 'd'] };
 const SAID = {
-  box: 'Press on a place and drag: a box around it. The wheel changes its size.', sphere: 'Press on a place and drag: a sphere around it. The wheel changes its size.',
-  brush: 'Paint over what you mean. The wheel changes the brush; Shift adds to it.', object: 'Click an object.',
-  plane: 'Press on a place: all that is higher. In general, where a x + b y + c z > d.',
+  box: 'Press on a point and drag: a box around it. The wheel changes its size.', sphere: 'Press on a point and drag: a sphere around it. The wheel changes its size.',
+  brush: 'Paint over a part. The wheel changes the size of the brush; Shift adds to the selection.', object: 'Click an object.',
+  plane: 'Press on a point to select all that is higher. In general: a x + b y + c z > d.',
 };
 const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 
@@ -22,7 +22,7 @@ export class Editor {
       dabs: () => [...(this.chosen?.brush ?? [])], preview: (shift) => this.preview({ move: shift }), move: (by) => this.act({ do: 'move', by }),
     });
     document.querySelectorAll('[data-tool]').forEach((button) => { button.onclick = () => this.take(button.dataset.tool); });
-    document.querySelectorAll('[data-do]').forEach((button) => { button.onclick = () => this.act(this.deed(button.dataset.do)); });
+    document.querySelectorAll('[data-do]').forEach((button) => { button.onclick = () => this.act(this.action(button.dataset.do)); });
     document.querySelectorAll('[data-preview]').forEach((fields) => {
       fields.oninput = () => this.preview(this.wished(fields.dataset.preview));
       fields.onchange = () => this.preview({});
@@ -63,10 +63,10 @@ export class Editor {
   typed() {
     const kind = Object.keys(this.chosen)[0], values = [...$('numbers').querySelectorAll('input')].map((input) => Number(input.value));
     if (values.every(Number.isFinite)) this.choose({ [kind]: values });
-    else this.on.say('A place is told in metres, such as 1.25.');
+    else this.on.say('Coordinates are in metres, such as 1.25.');
   }
 
-  /** What the fields of a deed say, as a preview. */
+  /** What the fields of a action say, as a preview. */
   wished(name) {
     const values = this.fields(name);
     return { move: { move: values }, turn: { turn: (values[0] * Math.PI) / 180 }, scale: { factor: values[0] > 0 ? values[0] : 1 } }[name];
@@ -80,26 +80,26 @@ export class Editor {
     this.on.redraw();
   }
 
-  deed(name) {
+  action(name) {
     const values = { move: 'move', duplicate: 'move', turn: 'turn', scale: 'scale' }[name], given = values ? this.fields(values) : [];
     const colour = [1, 3, 5].map((at) => Math.round((parseInt($('colour').value.slice(at, at + 2), 16) / 255) * 1000) / 1000);
     return { do: name, ...{ move: { by: given }, duplicate: { by: given }, turn: { degrees: given[0] }, scale: { factor: given[0] }, recolour: { colour }, delete: {} }[name] };
   }
 
-  act(deed) {
+  act(action) {
     if (!this.mask) return;
-    if (deed.do === 'scale' && !(deed.factor > 0)) { this.on.say('A place is scaled by a factor above 0.'); return; }
+    if (action.do === 'scale' && !(action.factor > 0)) { this.on.say('The factor must be above 0.'); return; }
     const { chosen } = this;
-    this.change(() => this.story.add({ select: chosen, ...deed }), { ...deed, chosen });
+    this.change(() => this.story.add({ select: chosen, ...action }), { ...action, chosen });
   }
 
   /** Does something to the story, and shows what came of it. */
-  change(does, { by, chosen, do: deed } = {}) {
+  change(does, { by, chosen, do: action } = {}) {
     try { does(); } catch (error) { this.on.say(error.message); return; }
     this.preview({});
     this.on.changed(this.story.scene);
-    const copied = deed === 'duplicate' && chosen.object ? { object: this.story.scene.objects.at(-1) } : chosen;
-    const next = deed === 'delete' ? null : by ? shifted(copied, by) : this.chosen;
+    const copied = action === 'duplicate' && chosen.object ? { object: this.story.scene.objects.at(-1) } : chosen;
+    const next = action === 'delete' ? null : by ? shifted(copied, by) : this.chosen;
     this.choose(next && select(this.story.scene, next).count ? next : null);
   }
 
@@ -114,7 +114,7 @@ export class Editor {
     try {
       const edits = (await file.text()).split('\n').filter((line) => line.trim()).map((line) => JSON.parse(line));
       this.change(() => this.story.replay(edits));
-    } catch { this.on.say(`${file.name} holds no edits of this place.`); }
+    } catch { this.on.say(`${file.name} holds no edits for this place.`); }
     $('open').value = '';
   }
 
@@ -124,11 +124,11 @@ export class Editor {
     const { story, chosen, mask } = this, kind = chosen && Object.keys(chosen)[0];
     const any = story.scene.objects.some(Boolean), object = document.querySelector('[data-tool=object]');
     object.disabled = !any;
-    object.title = any ? '' : 'This place has no objects of their own';
+    object.title = any ? '' : 'This place has no separate objects';
     $('count').textContent = !chosen ? 'Nothing selected' : `${(mask?.count ?? 0).toLocaleString('en')} selected${kind === 'object' ? `: ${story.scene.names[chosen.object - 1] || `object ${chosen.object}`}` : ''}`;
     $('tool-said').textContent = SAID[this.selecting.tool] + (mask ? MOVES : '');
     $('drop-chosen').hidden = !chosen;
-    $('deeds').disabled = !mask;
+    $('actions').disabled = !mask;
     $('numbers').replaceChildren(...(NAMES[kind] ?? []).map((name, at) => {
       const label = Object.assign(document.createElement('label'), { textContent: name });
       label.append(Object.assign(document.createElement('input'), { value: chosen[kind][at], ariaLabel: name }));
@@ -138,7 +138,7 @@ export class Editor {
     $('undo').disabled = !story.edits.length;
     $('redo').disabled = !story.undone.length;
     $('save').disabled = !story.unsaved;
-    $('edits').replaceChildren(...story.edits.map((edit, at) => Object.assign(document.createElement('li'), { textContent: told(edit), title: JSON.stringify(edit) })));
+    $('edits').replaceChildren(...story.edits.map((edit, at) => Object.assign(document.createElement('li'), { textContent: describe(edit), title: JSON.stringify(edit) })));
     [...$('edits').children].forEach((item, at) => { item.dataset.number = at + 1; });
     $('edits').scrollTop = 1e6;
   }

@@ -1,4 +1,4 @@
-// The language of edits, as space/edits.py speaks it: places are computed in double precision and kept in single.
+// Edits, as in space/edits.py: positions are computed in double precision and stored in single.
 
 import { joined } from './scene.js';
 
@@ -40,7 +40,7 @@ export function middleOf(scene, mask) {
 export function edited(scene, edit, others) {
   if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
-  if (!mask.count) throw new Error('nothing lies there; choose another place.');
+  if (!mask.count) throw new Error('nothing is selected there; choose another place.');
   if (edit.do === 'delete') return scene.at(numbers(mask, 0));
   if (edit.do === 'duplicate') {
     const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
@@ -71,7 +71,7 @@ function merged(scene, other, by, degrees) {
   return Object.assign(joined(scene, part), { names, boxes: known ? [...scene.boxes, ...placed(other.boxes, by, degrees / 90)] : null });
 }
 
-/** Boxes turned by so many quarters, then moved. */
+/** Boxes turned by quarter turns, then moved. */
 function placed(boxes, [dx, dy, dz], quarters) {
   const left = ([x0, y0, z0, x1, y1, z1]) => [-y1, x0, z0, -y0, x1, z1];
   for (let turn = 0; turn < ((quarters % 4) + 4) % 4; turn += 1) boxes = boxes.map(left);
@@ -117,7 +117,7 @@ const scaled = ({ means, scales }, factor, middle) => (k) => {
 const recoloured = ({ colours }, colour) => (k) => colours.set(colour, 3 * k);
 
 /** An edit in words. */
-export function told(edit) {
+export function describe(edit) {
   if (edit.do === 'merge') return `merge ${edit.place.split('/').at(-1)} at ${edit.by.join(' ')} m${edit.degrees ? `, turned by ${edit.degrees}°` : ''}`;
   const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? `object ${edit.select.object}` : `a ${kind}`;
   const more = { move: () => `by ${edit.by.join(' ')} m`, duplicate: () => `${edit.by.join(' ')} m away`, turn: () => `by ${edit.degrees}°`, scale: () => `× ${edit.factor}`, recolour: () => '', delete: () => '' }[edit.do]();

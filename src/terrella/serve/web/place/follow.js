@@ -1,4 +1,4 @@
-// Follows a place that is still being made: fetches its newest state as soon as there is one.
+// Follows a place while it is being fitted: fetches its newest state as soon as there is one.
 
 const PAUSE_MS = 700;
 

@@ -1,4 +1,4 @@
-// Keys, mouse and fingers: what they wish (forward, left, turn, up), and where they drag.
+// Keys, mouse and fingers: the motion that they ask for (forward, left, turn, up), and drags.
 
 const KEYS = { KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1], KeyA: [1, 1], KeyD: [1, -1], ArrowLeft: [2, 1], ArrowRight: [2, -1], Space: [3, 1], KeyC: [3, -1] };
 const STICK = 60;  // pixels from a thumb's rest to full speed

@@ -1,4 +1,4 @@
-// The place from above: its Gaussians below the eye as a picture, and the eye in it.
+// The place from above: a picture of the Gaussians below the eye, and the eye in it.
 
 const ABOVE = 0.35, STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 

@@ -1,4 +1,4 @@
-// What lies under the pointer: along a ray, where light has half ended.
+// The point under the pointer: along its ray, where the transmittance falls to one half.
 
 import { axesOf } from './draw.js';
 

@@ -1,4 +1,4 @@
-// The shaders: Gaussians as splats, lines, and what is done to a whole picture.
+// The shaders: Gaussians as splats, lines, and effects on the whole picture.
 
 export const SPLAT_SHADERS = [`#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;

@@ -1,4 +1,4 @@
-// Which little cubes of a place are solid, and how a body moves among them, as space/occupancy.py has it.
+// The occupancy grid of a place, and how a walker moves in it, as in space/occupancy.py.
 
 import { axesOf } from './draw.js';
 

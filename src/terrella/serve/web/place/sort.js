@@ -1,4 +1,4 @@
-// Which Gaussians a camera sees, the nearest first, and of far ones fewer: in a worker, by counting.
+// The Gaussians that a camera sees, nearest first, far ones thinned out: a counting sort in a worker.
 
 /** The worker's whole program: it is sent as text. It gets {means, scales} once and after edits, then one view after another. */
 function sorting() {

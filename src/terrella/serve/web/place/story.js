@@ -1,4 +1,4 @@
-// The edits of a place: those in force, those taken back, and the scene that they make of its source.
+// The edits of a place: those in force, those undone, and the scene after them.
 
 import { edited } from './edits.js';
 

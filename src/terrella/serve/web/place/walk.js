@@ -1,4 +1,4 @@
-// Walking and flying, step for step as worlds/splat.py has it; between two steps the eye glides.
+// Walking and flying, in the same steps as worlds/splat.py; the eye is interpolated between two steps.
 
 const GRAVITY = 9.81;
 
@@ -39,7 +39,7 @@ export class Walker {
     this.heading += speed[2];
   }
 
-  /** Time goes on by so many seconds; whether anything moves. */
+  /** Advances the time by some seconds; returns whether anything moves. */
   pass(solid, wish, seconds) {
     const { dt_s: dt } = this.world;
     this.left = Math.min(this.left + seconds, 8 * dt);

@@ -1,4 +1,4 @@
-// Lines around what is selected: boxes and spheres.
+// Lines around the selection: boxes and spheres.
 
 const COLOUR = [0.5, 0.89, 0.77, 0.9];
 

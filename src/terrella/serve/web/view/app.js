@@ -161,7 +161,7 @@ function seek(to) {
   dirty = true;
 }
 
-/** So many readings of the stepping sensor on or back, exactly onto their times. */
+/** Steps by readings of the stepping sensor, forward or back, exactly to their times. */
 function step(by) {
   if (!episode) return;
   if (playing) pause();
@@ -212,7 +212,7 @@ function drawList(reveal = false) {
     row.onclick = () => open(number);
     return row;
   }));
-  if (!filtered.length) $('rows').append(Object.assign(document.createElement('p'), { className: 'nobody', textContent: 'No episode is like that.' }));
+  if (!filtered.length) $('rows').append(Object.assign(document.createElement('p'), { className: 'nobody', textContent: 'No episode matches.' }));
 }
 
 function neighbour(by) {

@@ -1,4 +1,4 @@
-// What the server knows, fetched once and kept: the list, an episode's times and series, and its readings ahead of need.
+// The data of the server, fetched once and cached: the list, an episode's times and series, and its readings ahead of need.
 
 const AT_ONCE = 5;  // requests for readings under way
 const KEPT_BYTES = 320e6;  // of decoded readings
@@ -130,7 +130,7 @@ export class Episode {
     this.changed();
   }
 
-  /** A series between two times in so many buckets; undefined until it has come. */
+  /** A series between two times in `buckets` buckets; undefined until it has arrived. */
   curve(place, from, to, buckets, pick = false) {
     const key = `${place} ${from} ${to} ${buckets} ${pick}`;
     if (!this.series.has(key)) {

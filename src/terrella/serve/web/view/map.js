@@ -1,4 +1,4 @@
-// Where the body went, from above: its path in metres, and its heading at the playhead.
+// The path of the robot, from above: its path in metres, and its heading at the playhead.
 
 import { AMBER, AURORA } from './colours.js';
 

@@ -309,7 +309,7 @@ function isFlags(curve) {
   return curve.flags;
 }
 
-/** One mark for each reading; where they are too close for that, a band, with its gaps left open and told in amber. */
+/** One mark for each reading; where they are too dense, a band, with gaps left open and marked in amber. */
 function drawTicks(context, axis, sensor, width, top, height) {
   const { times, period } = sensor, first = Math.max(0, indexAt(times, axis.from)), last = indexAt(times, axis.to);
   const close = ((period / (axis.to - axis.from)) * width) < 3.5;
