@@ -151,7 +151,7 @@ def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeyp
         seen.render(seen.start(1, make_rng(0)), ("rgb",))
     except TerrellaError as error:
         pytest.skip(str(error))
-    for name, value in {"LABELLED": 64, "UNLABELLED": 64, "STEPS": 3}.items():
+    for name, value in {"LABELLED": 16, "UNLABELLED": 16, "TESTED": 16, "BATCH": 16, "STEPS": 3}.items():
         monkeypatch.setattr(transfer_camera, name, value)
     words = ("transfer", "--practice", 1, "--episodes", 4, "--seeds", 1, "--out", tmp_path / "t", "--json")
     plain = json.loads(ran(capsys, *words, "--arms", "nominal")[1])

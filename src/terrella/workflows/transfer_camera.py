@@ -21,6 +21,8 @@ from .transfer_experiment import PICTURE
 
 LABELLED = 2048  # pictures with their goals
 UNLABELLED = 512  # pictures of the real robot without goals
+TESTED = 256  # real pictures by which the error of an encoder is measured
+BATCH = 256  # pictures that are taken at once
 STEPS = 1000
 LABELLED_SEED, UNLABELLED_SEED = 3_000_003, 4_000_003
 ENCODERS = ("nominal", "randomised", "adversarial", "oracle")
@@ -37,6 +39,10 @@ class Encoders:
     @cached_property
     def _looks(self) -> tuple[torch.Tensor, torch.Tensor]:
         return pictures(Randomised(self.sim, read(self.looks)), LABELLED, LABELLED_SEED + self.seed)
+
+    @cached_property
+    def _test_pictures(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return pictures(self.real, TESTED, UNLABELLED_SEED - 1)
 
     def __getitem__(self, name: str) -> KeypointEncoder:
         """The encoder of this name, trained or loaded."""
@@ -58,7 +64,7 @@ class Encoders:
 
     def error(self, encoder: KeypointEncoder) -> float:
         """Mean distance between the goal that it reads off real pictures and the true one, in the goal's units."""
-        shown, goals = pictures(self.real, 256, UNLABELLED_SEED - 1)
+        shown, goals = self._test_pictures
         with torch.inference_mode():
             return float((encoder(shown) - goals).norm(dim=1).mean())
 
@@ -66,8 +72,8 @@ class Encoders:
 def pictures(world: World, count: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Pictures uint8 [count, H, W, 3] and goals [count, n] at the start of episodes."""
     batches, rng = [], make_rng(seed)
-    for _ in range(0, count, 256):
-        state = world.start(256, rng)
+    for _ in range(0, count, BATCH):
+        state = world.start(BATCH, rng)
         batches.append((world.render(state, ("rgb",))["rgb"], state[GOAL].float()))
     shown, goals = (torch.cat(part)[:count] for part in zip(*batches))
     return shown, goals
