@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 
 from terrella.data import ClipCache, Layout, Recorder, Sensor
 from terrella.data.channels import ACTION, DONE, REWARD, RGB
-from terrella.data.training.cache import finish, new_arrays
+from terrella.data.training.cache import finish_cache, new_arrays
 from terrella.data.training.clips import Clips, ClipsConfig
 
 LENGTH, BATCH, FPS = 16, 32, 30
@@ -158,7 +158,7 @@ def noise(folder: Path, pixels: int, rows: int) -> ClipCache:
     for at in range(0, rows, 1000):
         arrays["rgb"][at : at + 1000] = np.random.default_rng(at).integers(0, 256, (1, pixels, pixels, 3), np.uint8)
     starts = np.arange(0, rows, 500)
-    finish(folder / "staged", folder / "cache", arrays, np.stack([starts, starts + 500], 1), FPS)
+    finish_cache(folder / "staged", folder / "cache", arrays, np.stack([starts, starts + 500], 1), FPS)
     return ClipCache(folder / "cache")
 
 

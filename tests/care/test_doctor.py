@@ -15,7 +15,7 @@ from layouts import layout_of
 from sweeps import sweep
 
 from terrella.care import doctor
-from terrella.care.doctor import being_written, examine
+from terrella.care.doctor import examine, is_being_written
 from terrella.core import files
 from terrella.core.errors import DatasetError
 from terrella.data import Layout, Recorder
@@ -219,12 +219,12 @@ def test_a_recording_in_progress_is_no_fault(tmp_path):
     with Recorder(tmp_path, layout) as recorder:
         for _ in range(3):
             recorder.add({"pose": np.arange(7)}, [1.0])
-        assert being_written(tmp_path)
+        assert is_being_written(tmp_path)
         found = examine(tmp_path)
         assert found.faults == [] and found.notes == [
             "a recorder is writing to this folder now; the episode that it is recording was not examined"
         ]
-    assert not being_written(tmp_path)
+    assert not is_being_written(tmp_path)
 
 
 @pytest.mark.parametrize(

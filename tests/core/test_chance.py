@@ -51,3 +51,8 @@ def test_choice_follows_its_probabilities():
 def test_noise_can_be_drawn_on_another_device():
     some = seeds(3, make_rng(0), "meta")
     assert normal(some, (4, 9)).device.type == "meta" and choice(some, torch.ones(3, 4, device="meta")).shape == (3,)
+
+
+def test_choice_never_draws_an_entry_of_probability_0(monkeypatch):
+    monkeypatch.setattr("terrella.core.chance.uniform", lambda seeds, *_: torch.zeros(len(seeds)))
+    assert choice(seeds(2, make_rng(0)), torch.tensor([[0.0, 1.0, 0.0]] * 2)).tolist() == [1, 1]

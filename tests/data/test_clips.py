@@ -15,7 +15,7 @@ from terrella.core.errors import DatasetError
 from terrella.data import ClipCache, Dataset, Layout, Recorder
 from terrella.data.channels import RGB
 from terrella.data.source import Sensor
-from terrella.data.training.cache import finish, new_arrays
+from terrella.data.training.cache import finish_cache, new_arrays
 from terrella.data.training.clips import Clips, ClipsConfig
 from terrella.data.training.order import shuffled_numbers
 
@@ -34,7 +34,7 @@ def cache_of(folder, lengths, kinds=KINDS) -> ClipCache:
     for array in arrays.values():
         rows = np.arange(len(array)).reshape(-1, *[1] * (array.ndim - 1))
         array[:] = rows % 251 if array.dtype == np.uint8 else rows
-    finish(folder / "staged", folder / "cache", arrays, np.stack([stops - lengths, stops], 1), 10)
+    finish_cache(folder / "staged", folder / "cache", arrays, np.stack([stops - lengths, stops], 1), 10)
     return ClipCache(folder / "cache")
 
 

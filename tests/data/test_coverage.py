@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from terrella.core import Spec
-from terrella.data import Dataset, Layout, Recorder, coverage
+from terrella.data import Dataset, Layout, Recorder, measure_coverage
 
 
 def recorded(root, follows: str):
@@ -26,7 +26,7 @@ def recorded(root, follows: str):
             led = ((0, -1), (0, 1), (1, 0), (0, 0))[choice]
             move = {"actions": led, "itself": rng.integers(-1, 2, 2), "nothing": 0}[follows]
             at = (at + move) % 28
-    return coverage(Dataset(root))
+    return measure_coverage(Dataset(root))
 
 
 def test_it_tells_what_is_taught_from_what_is_not(tmp_path):

@@ -64,7 +64,7 @@ def doctor(root: str | Path) -> list[Fault]:
 def examine(root: str | Path) -> Examination:
     """Faults and notes. Reads every row once, the packets of every video, and some frames of each episode."""
     folder = survey(root)
-    busy = being_written(folder.root)
+    busy = is_being_written(folder.root)
     rows, shown = RowFacts(), FilmFacts()
     folder, faults = _without_leftovers(folder, busy)
     faults = [*folder.faults, *faults, *_counts(folder, busy)]
@@ -111,7 +111,7 @@ def _place(fault: Fault) -> str:
     return fault.file if fault.row is None else f"{fault.file}, row {fault.row}"
 
 
-def being_written(root: Path) -> bool:
+def is_being_written(root: Path) -> bool:
     """Whether a recorder holds the folder's lock."""
     try:
         with open(root / ".lock", "rb") as handle:

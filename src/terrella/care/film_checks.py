@@ -164,9 +164,8 @@ def _exchanged(keys: list[Key], looks: np.ndarray, kept: np.ndarray, noise: np.n
     """Among the videos that differ from their statistics, those that match the statistics of one another."""
     own = _distance(looks, kept)
     usual = _USUAL * float(np.median(own)) if len(keys) >= _FEW else 0.0
-    suspects = np.flatnonzero(
-        (own > np.maximum(_LIKE, np.maximum(noise, usual))) | (own > np.maximum(2 * _LIKE, noise))
-    )
+    unusual = own > np.maximum(_LIKE, np.maximum(noise, usual))
+    suspects = np.flatnonzero(unusual | (own > np.maximum(2 * _LIKE, noise)))
     exchanged: dict[Key, Key] = {}
     for i in suspects:
         distance = _distance(looks[i], kept[suspects])

@@ -106,9 +106,8 @@ def read_table(survey: Survey, file: str, path: Path, features: Mapping[str, dic
     for _, count, table in read_batches(path, features, [name for name in stored if name in names]):
         if isinstance(table, DatasetError) and count > _MOST_LOST:
             raise table  # a batch that claims more rows has none
-        columns, whole = (
-            ({}, np.zeros(count, bool)) if isinstance(table, DatasetError) else _numbers_of(table, features)
-        )
+        broken = isinstance(table, DatasetError)
+        columns, whole = ({}, np.zeros(count, bool)) if broken else _numbers_of(table, features)
         good.append(whole)
         for name, some in parts.items():
             some.append(columns[name].reshape(-1).astype(np.float64) if name in columns else np.full(count, np.nan))

@@ -25,7 +25,7 @@ from ..data.format import (
     sensor_from_json,
     whole_rate,
 )
-from ..data.meta import MOST, OPTIONAL, Episode, EpisodeTable, read_part, sentences
+from ..data.meta import MOST, OPTIONAL, Episode, EpisodeTable, read_part, read_task_texts
 from ..data.source import Sensor
 from ..data.storage import mp4
 from ..data.storage.remote import LocalFiles
@@ -391,7 +391,7 @@ def _looks(table: pa.Table, cameras: tuple[str, ...]) -> dict[tuple[int, str], L
 def _tasks(root: Path, episodes: Mapping[int, Episode], count: object, faults: list[Fault]) -> dict[int, str]:
     """task_index -> text. `count`: episodes in info.json; tasks of episodes after these (of a killed commit) may be missing."""
     try:
-        tasks = sentences(path_inside(root, TASKS))
+        tasks = read_task_texts(path_inside(root, TASKS))
         safe = [episode for number, episode in episodes.items() if not isinstance(count, int) or number < count]
         lost = sorted({task for episode in safe for task in episode.tasks} - set(tasks.values()))
         if lost:

@@ -206,7 +206,7 @@ def parse_keys(table: Mapping, space: spaces.Space) -> dict[str, list[float]]:
     return {code: action for code, action in parsed.items() if len(action) == width}
 
 
-def unnamed(space: spaces.Space) -> list[str]:
+def generated_names(space: spaces.Space) -> list[str]:
     """Generated names for the actions of a space: "action 0", "button 1", "axis 1"."""
     if isinstance(space, spaces.Discrete):
         return [f"action {at}" for at in range(int(space.n))]
@@ -216,10 +216,10 @@ def unnamed(space: spaces.Space) -> list[str]:
 
 def all_names(spec: Spec) -> list[str]:
     """A name for every action, generated where the spec has none."""
-    return [*spec.action_names, *unnamed(spec.action)[len(spec.action_names) :]]
+    return [*spec.action_names, *generated_names(spec.action)[len(spec.action_names) :]]
 
 
-def renamed(spec: Spec, names: Mapping[int, str]) -> Spec:
+def with_action_names(spec: Spec, names: Mapping[int, str]) -> Spec:
     """The spec with new names for the actions at these indices; its idle action stays the same.
 
     TerrellaError where two actions would have one name.
@@ -240,7 +240,7 @@ def with_changes(own: Spec, before: Spec, after: Spec) -> Spec:
     keys = {code: value for code, value in own.keys.items() if code in after.keys or code not in before.keys}
     keys |= {code: value for code, value in after.keys.items() if before.keys.get(code) != value}
     names = zip(all_names(before), all_names(after), strict=True)
-    return renamed(replace(own, keys=keys), {at: new for at, (old, new) in enumerate(names) if old != new})
+    return with_action_names(replace(own, keys=keys), {at: new for at, (old, new) in enumerate(names) if old != new})
 
 
 def with_controls(
@@ -289,9 +289,8 @@ def _action(spec: Spec, text: str) -> list[float]:
             else np.where(np.arange(len(low)) == at, high, rest).astype(np.float64).tolist()
         )
     if isinstance(spec.action, spaces.MultiDiscrete) and name in lower and value:
-        text = ",".join(
-            value if at == lower.index(name) else str(n) for at, n in enumerate(neutral_action(spec).ravel())
-        )
+        place, rest = lower.index(name), neutral_action(spec).ravel()
+        text = ",".join(value if at == place else str(n) for at, n in enumerate(rest))
     try:
         action = [float(number) for number in text.split(",")]
     except ValueError:

@@ -133,9 +133,8 @@ class State(Mapping):
     def fork(self, n: int) -> State:
         """Each batch entry n times in a row: [a, b].fork(2) is [a, a, b, b]. Copies of a single entry take no memory."""
         if self.batch == 1:
-            return self._combined(
-                [self], lambda tensor: tensor.expand(n, *tensor.shape[1:]), lambda rows: rows.expand(n)
-            )
+            expand = lambda tensor: tensor.expand(n, *tensor.shape[1:])  # noqa: E731
+            return self._combined([self], expand, expand)
         return self._combined([self], *[lambda tensor: tensor.repeat_interleave(n, dim=0)] * 2)
 
     def where(self, which: torch.Tensor, other: State) -> State:

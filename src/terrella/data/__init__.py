@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .coverage import Coverage, coverage
+from .coverage import Coverage, measure_coverage
 from .dataset import Dataset
 from .format import Layout
 from .game import check_game
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ClipCache", "Clips", "ClipsConfig", "Coverage", "Dataset", "Episode", "Layout", "Readings", "RecordOptions",
-    "Recorder", "Sensor", "Source", "Take", "check_game", "coverage", "record", "split",
+    "Recorder", "Sensor", "Source", "Take", "check_game", "measure_coverage", "record", "split",
 ]  # fmt: skip
 
 

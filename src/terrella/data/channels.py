@@ -53,7 +53,7 @@ def channel_of(feature: str, names: Iterable[str] = ()) -> str:
     return RENAMED.get(channel, channel)
 
 
-def renamed(feature: str) -> str:
+def current_feature(feature: str) -> str:
     """The name now of a feature of an old recording."""
     channel = feature.removeprefix("observation.")
     return f"observation.{RENAMED[channel]}" if channel in RENAMED and channel != feature else feature

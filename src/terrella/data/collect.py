@@ -142,9 +142,8 @@ def _gather(
             next_number = number + 1
         for number, answer in workers.answers():
             if isinstance(answer, str):
-                raise TerrellaError(
-                    f"{answer.rstrip('.')}. {recorder.episodes:,} episodes are safe in {recorder.root}."
-                )
+                safe = f"{recorder.episodes:,} episodes are safe in {recorder.root}."
+                raise TerrellaError(f"{answer.rstrip('.')}. {safe}")
             done[number] = answer
         while missing() and recorder.episodes in done:
             recorder.put_episode(done.pop(recorder.episodes))

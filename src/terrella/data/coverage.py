@@ -54,7 +54,7 @@ class Coverage:
         return [f"this recording teaches little: {'; '.join(reasons)}; {more}."] if reasons else []
 
 
-def coverage(dataset: Dataset, most: int = 4000) -> Coverage:
+def measure_coverage(dataset: Dataset, most: int = 4000) -> Coverage:
     """The coverage of a recording, from up to `most` rows in stretches of up to 250."""
     small, actions, starts, changed, much = [], [], [], 0, 0
     if dataset.rgb_key is None or dataset.length < 2:

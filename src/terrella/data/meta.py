@@ -69,11 +69,11 @@ def read_tasks(root: Path, files: LocalFiles | Files) -> tuple[str, ...]:
     if not files.exists(TASKS):
         return ()
     with _readable(root / TASKS):
-        texts = sentences(files.local(TASKS))
+        texts = read_task_texts(files.local(TASKS))
     return tuple(texts.get(number, "") for number in range(max(texts, default=-1) + 1))
 
 
-def sentences(path: Path) -> dict[int, str]:
+def read_task_texts(path: Path) -> dict[int, str]:
     """task_index -> text, of a table of tasks; DatasetError or ValueError where it is not one."""
     table = read_whole(path)
     texts = next((name for name in ("__index_level_0__", "task") if name in table.column_names), None)

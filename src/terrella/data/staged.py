@@ -216,11 +216,11 @@ def _unpacked(raw: bytes, sensors: Sequence[Sensor], encode: bool) -> dict:
         dtype = np.dtype(np.uint16 if sensor.kind == "depth" else sensor.dtype)
         array = np.frombuffer(raw, dtype, int(np.prod(sensor.shape)), at).reshape(sensor.shape)
         at += array.nbytes
-        values[sensor.name] = png(array) if sensor.kind == "image" and encode else array
+        values[sensor.name] = encode_png(array) if sensor.kind == "image" and encode else array
     return values
 
 
-def png(picture: np.ndarray) -> bytes:
+def encode_png(picture: np.ndarray) -> bytes:
     """uint8 [H, W, 3] as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "PNG", compress_level=1)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.errors import TerrellaError
-from ..core.keys import all_names, renamed
+from ..core.keys import all_names, with_action_names
 from ..core.spec import CHOICE, Spec, neutral_action
 from .actions import axes_of
 
@@ -135,7 +135,7 @@ class KeyBook:
             if place is None:
                 raise TerrellaError(f"'{self._actions[at].name}' combines other actions; it has no name of its own.")
             names[place] = name
-        return renamed(replace(spec, keys=keys), names)
+        return with_action_names(replace(spec, keys=keys), names)
 
     def keep(self, spec: Spec) -> None:
         """Uses these keys and stores them. TerrellaError if they cannot be stored; they are in use all the same."""

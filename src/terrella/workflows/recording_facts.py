@@ -52,7 +52,7 @@ def _action_text(spec: Spec, action: list[float]) -> str:
 
 def recording_facts(dataset: Dataset, world: str, progress: Progress) -> dict[str, object]:
     """The figures of a recording of `world`, with a picture of it to look at; warns of a recording that teaches little."""
-    from ..data import coverage
+    from ..data import measure_coverage
 
     facts: dict[str, object] = {"frames": dataset.length, "episodes": len(dataset.episodes), "world": world}
     if dataset.has("rgb"):
@@ -60,7 +60,7 @@ def recording_facts(dataset: Dataset, world: str, progress: Progress) -> dict[st
         facts["look"] = str(_contact_sheet(dataset, root / "look.jpg"))
         films = sorted(root.glob("videos/*/chunk-*/*.mp4"))
         facts |= {"film": str(films[0])} if films else {}
-        covered = coverage(dataset)
+        covered = measure_coverage(dataset)
         facts |= covered.facts()
         for warning in covered.warnings():
             progress(f"Warning: {warning}")

@@ -188,9 +188,8 @@ class Files:
             except (FileNotFoundError, NotADirectoryError):
                 entries = []
             files = (about for about in entries if about["type"] == "file")
-            self._listed[folder] = {
-                about["name"].rsplit("/", 1)[-1]: _size_and_mark(self.root, about) for about in files
-            }
+            facts = {about["name"].rsplit("/", 1)[-1]: _size_and_mark(self.root, about) for about in files}
+            self._listed[folder] = facts
         return self._listed[folder].get(last)
 
     def _fetch(self, name: str, size: int, path: Path) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...core import files
 from ...core.errors import DatasetError
-from ..channels import ESTIMATES, channel_of, feature_of, renamed
+from ..channels import ESTIMATES, channel_of, current_feature, feature_of
 from ..dataset import Dataset
 from ..format import INFO
 from ..source import Lazy
@@ -234,7 +234,9 @@ def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path
             raise
     ranges = np.stack([dataset.episodes.starts, dataset.episodes.stops], 1)
     facts = {"action_names": list(dataset.action_names), "world": dataset.world}
-    finish(staged, path, arrays, ranges, dataset.fps, facts | {"tasks": list(dataset.tasks), "keys": keys_of(dataset)})
+    finish_cache(
+        staged, path, arrays, ranges, dataset.fps, facts | {"tasks": list(dataset.tasks), "keys": keys_of(dataset)}
+    )
 
 
 def further_cameras(dataset: Dataset, channels: Sequence[str]) -> list[str]:
@@ -253,7 +255,7 @@ def array_for(channel: str, arrays: Collection[str], keys: Mapping[str, str]) ->
 def keys_of(dataset: Dataset) -> dict[str, str]:
     """channel -> the array that holds it."""
     arrays = {dataset.feature(name): name for name in _TYPES if dataset.feature(name)}
-    return {channel: arrays.get(feature, renamed(feature)) for channel, feature in dataset.channels.items()}
+    return {channel: arrays.get(feature, current_feature(feature)) for channel, feature in dataset.channels.items()}
 
 
 def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:
@@ -273,9 +275,9 @@ def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = (
         if Path(name).name != name:
             raise DatasetError(f"a feature is named '{name[:100]}', which no file can be; rename it in meta/info.json.")
         if sensor.kind == "depth" and name not in taken:
-            kinds[renamed(name)] = (np.dtype(np.float16), sensor.shape)
+            kinds[current_feature(name)] = (np.dtype(np.float16), sensor.shape)
         elif sensor.kind == "vector" and sensor.dtype in _NUMBERS and name not in taken:
-            kinds[renamed(name)] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
+            kinds[current_feature(name)] = (np.dtype(_NUMBERS[sensor.dtype]), sensor.shape)
     for name in cameras:
         if name not in dataset.cameras:
             raise DatasetError(f"{dataset.root} has no camera '{name}'; it has {', '.join(dataset.cameras) or 'none'}.")
@@ -303,7 +305,7 @@ def new_arrays(folder: Path, kinds: Kinds, rows: int) -> dict[str, np.ndarray]:
     return arrays
 
 
-def finish(
+def finish_cache(
     staged: Path,
     path: Path,
     arrays: Mapping[str, np.ndarray],
