@@ -1,5 +1,5 @@
 """Estimator: what a picture alone says of space: how far everything is, how the viewer moved since the one before, and whether
-it looks like the pictures that it learned from. Trained by learn/senses.py."""
+it looks like the pictures that it learned from. Trained by learn/objectives/estimator.py."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class EstimatorObjective:
         self.modules = {"estimator": self.estimator}
         self.learners = {"estimator": adamw((self.estimator,), warmup_cosine(learning_rate, 50, 0.02))}
 
-    def picked(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
         """Pictures [n, 3, H, W] in 0..1 and their depth, some mirrored, some recoloured."""
         rows = now.rng.choice(self.rows, self.size)
         recording, size = self.recording, _size(self.recording)
@@ -77,7 +77,7 @@ def learn_estimator(
 ) -> Estimator:
     """A depth and odometry estimator, learned on the CPU."""
     objective = EstimatorObjective(recording, batch, learning_rate, run.seed)
-    trainer = Trainer(run, "estimator", RandomBatches(objective.picked), objective, steps, device=CPU)
+    trainer = Trainer(run, "estimator", RandomBatches(objective.sample), objective, steps, device=CPU)
     trainer.train()
     estimator = objective.estimator.eval().requires_grad_(False)
     with torch.inference_mode():

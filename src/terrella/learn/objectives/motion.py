@@ -30,7 +30,7 @@ def learn_motion(run: Run, motion: Motion, recording: Recording, memory: Keyfram
     motion.middle.copy_((seen.place.amin(0) + seen.place.amax(0)) / 2)
     motion.span.copy_((seen.place.amax(0) - seen.place.amin(0)).max().clamp_min(1e-3))
     objective, ended = MotionObjective(motion, seen), bool(seen.ended.any())
-    trainer = Trainer(run, "motion", RandomBatches(objective.picked), objective, steps, device=CPU)
+    trainer = Trainer(run, "motion", RandomBatches(objective.sample), objective, steps, device=CPU)
     trainer.train()
     if not ended:  # no episode of the recording ended
         last = list(motion.ending.parameters())[-2:]
@@ -81,7 +81,7 @@ class MotionObjective:
 
         self.learners = {"motion": Learner(optimiser, (motion,), rate, clip=math.inf)}
 
-    def picked(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
+    def sample(self, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
         """Rows of a batch of steps, and those from which termination is learned."""
         pick = torch.from_numpy(now.rng.integers(0, len(self.seen.heading), _BATCH))
         ends = pick.clone()

@@ -107,7 +107,7 @@ def learn_objects(
         for row, billboard in enumerate(billboards[: objects.config.rows]):
             objects.begun[episode, row] = billboard
     objective = ObjectsObjective(objects, tokens, recording)
-    trainer = Trainer(run, "objects", RandomBatches(objective.picked), objective, steps, device=CPU)
+    trainer = Trainer(run, "objects", RandomBatches(objective.sample), objective, steps, device=CPU)
     trainer.train()
     objects.eval()
     facts = {"objects_frames": len(rows), "objects_looks": len(heads), "objects_moves": len(moves) - 1}
@@ -350,7 +350,7 @@ class ObjectsObjective:
         self.modules = {"objects": objects}
         self.learners = {"objects": adamw((objects,), warmup_cosine(2e-3, 100, 0.02), decay=1e-2, betas=(0.9, 0.999))}
 
-    def picked(self, now: TrainStep) -> torch.Tensor:
+    def sample(self, now: TrainStep) -> torch.Tensor:
         return torch.multinomial(self.often, self.size, replacement=True, generator=now.noise)
 
     def losses(self, batch: torch.Tensor, now: TrainStep) -> Iterator[Loss]:

@@ -111,7 +111,7 @@ class OutcomeObjective:
         self.modules = {"outcome": outcome}
         self.learners = {"outcome": Learner(optimiser, (outcome,), warmup_cosine(learning_rate, 50, 0.03))}
 
-    def picked(self, now: TrainStep) -> tuple[np.ndarray, torch.Tensor]:
+    def sample(self, now: TrainStep) -> tuple[np.ndarray, torch.Tensor]:
         """The first rows of a batch of clips, and their importance weights."""
         picks = now.rng.choice(len(self.starts), self.size, p=self.often)
         return self.starts[picks], torch.from_numpy(self.even[picks] / self.often[picks]).float()
@@ -142,7 +142,7 @@ def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:
     """Trains the objective's FrameOutcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    trainer = Trainer(run, "outcome", RandomBatches(objective.picked), objective, steps)
+    trainer = Trainer(run, "outcome", RandomBatches(objective.sample), objective, steps)
     trainer.train()
     objective.outcome.eval()
     return {"outcome_steps": trainer.facts["step"]}

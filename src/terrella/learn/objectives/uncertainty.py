@@ -110,7 +110,7 @@ def uncertainty_seconds(world: LearnedWorld, recording: Recording, frames: int) 
         objective = UncertaintyObjective(UncertaintyNetwork(UncertaintyConfig(seen.situation.shape[1])), seen)
     for step in range(3):
         now = TrainStep(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
-        for loss in objective.losses(objective.picked(now), now):
+        for loss in objective.losses(objective.sample(now), now):
             loss.value.backward()
     return dreamt_s * frames + (time.monotonic() - began) * _steps(frames) / 3
 
@@ -249,7 +249,7 @@ class UncertaintyObjective:
         self.modules = {"uncertainty": uncertainty}
         self.learners = {"uncertainty": adamw((uncertainty,), warmup_cosine(3e-3, 50), decay=1e-3)}
 
-    def picked(self, now: TrainStep) -> tuple[torch.Tensor, ...]:
+    def sample(self, now: TrainStep) -> tuple[torch.Tensor, ...]:
         """A batch of 64 frames: clues, situations, cells and errors; some mirrored, some with permuted colours."""
         pick = torch.from_numpy(now.rng.integers(0, len(self.seen.error), 64))
         maps, cells = self.seen.clues[pick].float(), self.seen.cells[pick]
@@ -272,7 +272,7 @@ def fit_uncertainty(run: Run, seen: DreamFrames, steps: int) -> UncertaintyNetwo
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(run.seed)
         objective = UncertaintyObjective(UncertaintyNetwork(UncertaintyConfig(seen.situation.shape[1])), seen)
-    trainer = Trainer(run, "uncertainty", RandomBatches(objective.picked), objective, steps, device=CPU)
+    trainer = Trainer(run, "uncertainty", RandomBatches(objective.sample), objective, steps, device=CPU)
     trainer.limit_s *= 1 - DREAMING
     trainer.train()
     return objective.uncertainty.eval().requires_grad_(False)
