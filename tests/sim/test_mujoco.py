@@ -21,7 +21,7 @@ if find_spec("mujoco") is None:
 
 from terrella.sim.mujoco_model import mujoco
 from terrella.sim.mujoco_robots import robot_of
-from terrella.sim.mujoco_tasks import Hold, Reach, Stepping, VelocityTracking
+from terrella.sim.mujoco_tasks import Hold, Reach, RobotLayout, Stepping, VelocityTracking
 from terrella.sim.mujoco_world import MujocoConfig, MujocoWorld
 
 ARM = """<mujoco><option timestep="0.004"/><worldbody>
@@ -180,6 +180,18 @@ def test_a_file_tells_its_task(arm):
     world = load(f"mujoco:{arm}", cameras=())
     assert world.task == Hold(dwell=5) and {"reward", "success"} < set(world.spec.channels)
     check_world(world)
+
+
+def test_success_needs_steps_in_a_row_at_the_goal():
+    joints, axes = torch.zeros(2), (torch.arange(2), torch.arange(2))
+    layout = RobotLayout(
+        slice(1, 3), slice(3, 5), axes, joints, joints, joints - 1, joints + 1, {"hand": slice(0, 3)}, 0.02
+    )
+    task, held = Hold(dwell=2), torch.zeros(1, dtype=torch.int64)
+    for away_m, count in ((0.0, 1), (0.5, 0), (0.0, 1), (0.02, 2)):
+        after = {"physics": torch.zeros(1, 5), "sensors": torch.tensor([[away_m, 0, 0]]), "goal": torch.zeros(1, 2)}
+        held = task.evaluate(layout, {"held": held}, after)[2]["held"]
+        assert held.tolist() == [count] and task.render(layout, {"held": held}, "success").tolist() == [count >= 2]
 
 
 def test_names_that_there_are_not(arm):
