@@ -73,7 +73,7 @@ def _dot_plot(evaluation: PolicyEvaluation) -> str:
     names_of = {REAL: "in reality", DREAM: "in the dream"}
     keys = [Line(names_of[arm], (), (), (), (), colour) for arm, colour in shown.items()]
     keys += [Line("acting at random" + (" in reality" if real else ""), (), (), (), (), QUIET)] if floor else []
-    label = "share of successes" if evaluation.what == SUCCESS else evaluation.what
+    label = "success rate" if evaluation.what == SUCCESS else evaluation.what
     return f'<div class=scroll><div style="min-width:560px">{dot_plot(rows, label, guides)}</div></div>{legend(keys)}'
 
 
