@@ -241,6 +241,11 @@ def test_an_outcome_begins_steps_and_renders(world):
     ends = torch.tensor([True, False, False])
     step = outcome.step(before, drawn, ends, numbers, chance.seeds(B, make_rng(0)))
     entries(step, before)
+    if outcome.kind == "constant":
+        usual, ending = outcome.config.usual, outcome.config.ending
+        assert step["done"].tolist() == ends.tolist() and step["reward"].tolist() == pytest.approx(
+            [usual + ending, usual, usual]
+        )
     channels = outcome.channels().shows
     assert {"reward", "done"} <= set(channels)
     for name, tensor in outcome.render(drawn, tuple(channels)).items():
