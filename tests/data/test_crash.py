@@ -50,10 +50,11 @@ import sys
 sys.path.insert(0, {folder!r})
 from corridor import Corridor, keys
 from terrella.core import make_rng
-from terrella.data import record
+from terrella.data import RecordOptions, record
 def tell(rows, frames):
     print(rows, flush=True)
-record(Corridor(), keys, {root!r}, frames=100_000, rng=make_rng(3), progress=tell, max_episode_steps=29)
+options = RecordOptions(max_episode_steps=29)
+record(Corridor(), keys, {root!r}, frames=100_000, rng=make_rng(3), progress=tell, options=options)
 """
 
 
