@@ -139,7 +139,14 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], list[tuple[int, int, int]], str
 }
 
 
-QUICK = ("info.json and meta/episodes", "a footer", "a cut video", "rows away", "a number that is none")
+QUICK = (
+    "info.json and meta/episodes",
+    "a footer",
+    "a cut video",
+    "a copied file",
+    "rows away",
+    "a number that is none",
+)
 
 
 @pytest.mark.parametrize("name", sweep(DAMAGES, *QUICK))
