@@ -159,6 +159,9 @@ def test_a_scene_starts_looks_takes_the_frame_and_renders(world):
     )
     entries({name: taken[name] for name in scene.drawn_names if name in taken}, before)
     assert set(scene.earlier_names) <= set(before) and all(f"earlier_{name}" in before for name in scene.earlier_names)
+    after_it = world.take(after, before, world.look(after, before), torch.zeros(B, 5 if moving else 4, *SIZE))
+    for name in scene.earlier_names:
+        assert torch.equal(after_it[f"earlier_{name}"], before[name]), "what the frame before the last was"
     channels = scene.channels().shows
     for name, tensor in scene.render(taken, tuple(channels)).items():
         assert tensor.shape == (B, *channels[name].shape), name
@@ -216,6 +219,8 @@ def test_objects_start_act_are_painted_and_stop_bodies(world):
     assert all(torch.equal(part, objects.step(before, after, seeds)[name]) for name, part in step.items())
     none = Walls(torch.zeros(0, 4), torch.zeros(B, 0, 4))
     assert objects.add_walls(none, before, 0.1).own.shape[::2] == (B, 4)
+    if objects:
+        assert torch.equal(objects.add_walls(none, before, 0.1).own, objects.bodies(before, 0.1)), "they stop bodies"
     deep = torch.full((B, *SIZE), 2.0)
     frame = DrawnFrame(torch.full((B, 3, *SIZE), 7, dtype=torch.uint8), deep, 0 * deep)
     painted = objects.paint(before, frame, camera)
