@@ -142,7 +142,7 @@ def dreamt(
         pose = recording.pose(rows + step)
         where, ahead = project(cards[..., PLACE], pose, world.config.camera)
         seeds = chance.seeds(len(cards), rng)
-        cards = objects.step(cards, (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.5), pose, acts, seeds)
+        cards = objects.act(cards, (ahead > 0.2) & ((where[..., 0] - 0.5).abs() < 0.5), pose, acts, seeds)
         look = cards[..., LOOK].long()
         fell |= (cards[..., NUMBER] > 0) & (look != NONE) & (objects.boxes[look.clamp_min(0), 3] < LOW_M)
         places.append(cards[..., PLACE])

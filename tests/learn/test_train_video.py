@@ -58,7 +58,7 @@ def test_a_stopped_run_without_geometry_goes_on_exactly(corridor, flat_run, tmp_
 
 @pytest.mark.slow
 def test_a_run_that_is_stopped_in_each_of_its_stages_goes_on_exactly(corridor, posed_run, flat_run, tmp_path):
-    stages = {"motion": 7, "outcome": 1, "estimator": 1, "flow": 0, "uncertainty": 3}
+    stages = {"motion": 7, "estimator": 1, "flow": 0, "uncertainty": 3}
     resumes_exactly(lambda out: train_video(corridor, out, POSED, quiet), posed_run[0], tmp_path / "posed", stages)
     worlds = [load_file(data_file(run / "world", "weights")) for run in (posed_run[0], tmp_path / "posed")]
     assert all(torch.allclose(worlds[0][name].float(), worlds[1][name].float(), atol=1e-4) for name in worlds[0])

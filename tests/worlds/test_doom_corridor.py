@@ -62,7 +62,7 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
             acts[..., world.spec.action_names.index("ATTACK")] = attack
             low = torch.zeros(STORIES, dtype=torch.bool)
             for _ in range(STEPS):
-                billboards = objects.step(
+                billboards = objects.act(
                     billboards,
                     torch.ones(STORIES, objects.config.rows, dtype=torch.bool),
                     looks,
