@@ -243,9 +243,7 @@ def test_a_file_is_no_folder_to_record_to(capsys, tmp_path):
 
 def test_what_an_environment_played_before_it_failed_is_kept(capsys, tmp_path):
     said = refusal(["record", "world", FAILS, "--out", tmp_path / "set", "--frames", 500], capsys)
-    assert said.startswith(
-        f"terrella: {FAILS} fails when it is stepped, by an error of its own: OSError: the engine is"
-    )
+    assert said.startswith(f"terrella: {FAILS} fails when it is stepped, with its own error: OSError: the engine is")
     kept = Dataset(tmp_path / "set")
     assert f"{kept.length} frames are safe" in said and kept.length > 100 and not doctor(tmp_path / "set")
 

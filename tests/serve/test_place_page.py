@@ -319,7 +319,7 @@ def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened,
 def test_a_place_is_compared_with_what_it_was_and_with_another(tmp_path, opened):
     page = opened(exported(tmp_path, 3000))
     page.keyboard.press("KeyB")
-    assert not page.evaluate("terrella.compare.open") and "not edited" in page.inner_text("#toast")
+    assert not page.evaluate("terrella.compare.open") and "no edits to compare" in page.inner_text("#toast")
     page.evaluate("terrella.stand([1.0, 2.0, 1.6], 0.2, -0.3)")
     page.evaluate(
         "terrella.editor.change(() => terrella.story.add({ select: { all: 0 }, do: 'recolour', colour: [1, 0, 0] }))"
