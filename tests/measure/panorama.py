@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 
@@ -68,7 +68,8 @@ class Panorama:
 
     @property
     def spec(self) -> Spec:
-        return _spec_of(self.flaw, HEIGHT, WIDTH)
+        shared = _spec_of(self.flaw, HEIGHT, WIDTH)
+        return replace(shared, channels=dict(shared.channels))  # subclasses add channels to it
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         if batch < 1:
