@@ -16,7 +16,7 @@ from terrella.core import Spec, State, make_rng, rollout
 from terrella.core.errors import TerrellaError
 from terrella.core.spec import REWARD
 from terrella.learn.growth import Growth
-from terrella.learn.objectives.ppo import EPOCHS, MINIBATCHES, AdaptiveRate
+from terrella.learn.objectives.ppo import CLIP, EPOCHS, MINIBATCHES, AdaptiveRate, clipped_surrogate
 from terrella.learn.recipes.policy import Practice, train_policy
 
 
@@ -65,6 +65,12 @@ def test_it_learns_what_pays_and_goes_on_exactly(tmp_path):
     assert again["practised_steps"] == 20 * 64 * 8
     weights = (Actor.load(tmp_path / name, world.spec).network.state_dict() for name in ("run", "again"))
     assert all(torch.equal(a, b) for a, b in zip(*(one.values() for one in weights)))
+
+
+def test_the_surrogate_gains_nothing_beyond_the_clip_and_keeps_every_loss():
+    ratio, advantage = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.1]), torch.tensor([1.0, 1.0, -1.0, -1.0, 2.0])
+    expected = torch.tensor([1 + CLIP, 0.5, -1.5, -(1 - CLIP), 2.2])
+    torch.testing.assert_close(clipped_surrogate(ratio, advantage), expected)
 
 
 def test_a_rate_that_moves_the_policy_too_far_is_lowered_and_comes_back():

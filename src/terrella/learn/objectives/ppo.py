@@ -19,6 +19,10 @@ TARGET_KL = 0.03  # nats: the epochs end once the policy has moved further from 
 DECREASE, INCREASE, LOWEST = 1 / 1.5, 1.05, 0.02  # of the learning rate, see AdaptiveRate
 
 
+def clipped_surrogate(ratio: torch.Tensor, advantage: torch.Tensor) -> torch.Tensor:
+    return torch.minimum(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
+
+
 class AdaptiveRate(nn.Module):
     """The factor of the learning rate: it falls after a batch whose first epoch reached the target KL, and rises again after one
     that never did (as in Rudin et al. 2021, "Learning to walk in minutes")."""
@@ -71,8 +75,7 @@ class Ppo:
                 approx_kl = ((ratio.detach() - 1 - log_ratio.detach()) * weight).sum()
                 if approx_kl > TARGET_KL:
                     return self.adaptive.update(epoch * MINIBATCHES + at)
-                advantage = advantages[rows]
-                surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - CLIP, 1 + CLIP) * advantage)
+                surrogate = clipped_surrogate(ratio, advantages[rows])
                 entropy = distribution.entropy(actions[rows])
                 parts = {**facts, "entropy": (entropy.detach() * weight).sum(), "approx_kl": approx_kl}
                 yield Loss("actor", -((surrogate + self.returns.entropy * entropy) * weight).sum(), parts)
