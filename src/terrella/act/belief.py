@@ -1,7 +1,5 @@
 """BeliefPolicy: a policy that acts on a world's state, folded from the observations of an environment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import final
 

@@ -1,7 +1,5 @@
 """CountBased: a count-based exploration policy for any world."""
 
-from __future__ import annotations
-
 import math
 import struct
 import zlib

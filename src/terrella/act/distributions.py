@@ -4,8 +4,6 @@ A sample is float [N, D]: the number of each choice, each button, or a number th
 Haarnoja et al. 2018). `ActorConfig.actions` turns samples into actions of a world.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

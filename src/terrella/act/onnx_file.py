@@ -1,7 +1,5 @@
 """A learned policy as one ONNX file, with normalisation and action limits inside, to run without PyTorch."""
 
-from __future__ import annotations
-
 import warnings
 from importlib.util import find_spec
 from pathlib import Path

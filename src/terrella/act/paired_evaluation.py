@@ -1,7 +1,5 @@
 """Paired evaluation of policies in a world and in the real environment: the same starts, a matched control, open-loop errors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Policies by name: random, idle, plan:samples=16, constant:0.5, a user's MODULE:NAME; NAME@0.3 adds 30% random actions."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import os

@@ -6,8 +6,6 @@ stretches and tested on the other. The gain of s is the share of the baseline's 
 a correct recording shift 0 has the largest gain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

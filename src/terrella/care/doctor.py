@@ -1,7 +1,5 @@
 """doctor: examines any LeRobot v3 recording, however damaged; names each fault, its place and how to mend it."""
 
-from __future__ import annotations
-
 import fcntl
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Features read from tables and videos, for recordings whose meta/info.json is missing or wrong."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

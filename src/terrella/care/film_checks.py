@@ -1,7 +1,5 @@
 """Faults of videos: wrong lengths, damaged frames, exchanged or missing files."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field

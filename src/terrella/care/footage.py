@@ -1,7 +1,5 @@
 """footage: finds the frames of each episode in the videos of a damaged recording, and the rows that they show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ The pages still say how large they are and how many values they hold; which colu
 order and from how many numbers a row of each column has. A row group of which a column is missing is given up.
 """
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Mapping

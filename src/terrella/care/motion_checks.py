@@ -1,7 +1,5 @@
 """Whether the actions of a recording stand in the right rows, judged by the motion of the body or of the pictures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

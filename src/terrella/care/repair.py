@@ -1,7 +1,5 @@
 """repair: writes a mended copy of a damaged recording that keeps every whole row; the original does not change."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping

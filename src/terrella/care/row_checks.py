@@ -1,7 +1,5 @@
 """Faults of rows: schema, counters, timestamps, values, pictures, statistics, and states that do not change."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator, Mapping

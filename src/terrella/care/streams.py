@@ -1,7 +1,5 @@
 """Streams next to the rows: what a doctor finds in them, and how a repair cuts them to the pieces of an episode."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path

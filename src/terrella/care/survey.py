@@ -1,7 +1,5 @@
 """survey: reads the metadata of a LeRobot v3.0 folder file by file, so that one broken file does not hide the others."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -3,8 +3,6 @@
 A struct is a dict: field number -> (type, value). A list is (type of its items, items).
 """
 
-from __future__ import annotations
-
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 _DEEPEST, _LONGEST = 32, 1_000_000  # nesting, items of a list; more is damage
 

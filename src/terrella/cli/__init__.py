@@ -1,7 +1,5 @@
 """The command line: finds the command, runs it, and turns errors into one sentence."""
 
-from __future__ import annotations
-
 import errno
 import multiprocessing
 import signal

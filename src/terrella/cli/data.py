@@ -1,7 +1,5 @@
 """The commands that look after recordings: doctor, convert, merge, view, label."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

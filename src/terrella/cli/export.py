@@ -1,7 +1,5 @@
 """The commands `terrella export ...`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tyro.conf import Positional

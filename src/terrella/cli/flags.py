@@ -1,7 +1,5 @@
 """Says what is wrong when a flag that takes no value was given one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
 from typing import Any, get_args, get_type_hints

@@ -1,7 +1,5 @@
 """The command `terrella learn`."""
 
-from __future__ import annotations
-
 from tyro.conf import Positional
 
 from ..core.errors import TerrellaError

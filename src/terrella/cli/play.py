@@ -1,7 +1,5 @@
 """The command `terrella play`: a world, or a game and a world side by side, on a page in the browser."""
 
-from __future__ import annotations
-
 from tyro.conf import Positional
 
 from ..core.world import World

@@ -1,7 +1,5 @@
 """The commands `terrella record ...`."""
 
-from __future__ import annotations
-
 from tyro.conf import Positional
 
 from ..workflows.collect import CollectConfig, DoomRecordConfig, collect, collect_doom

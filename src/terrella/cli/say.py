@@ -1,7 +1,5 @@
 """What every command prints, and the options that many share."""
 
-from __future__ import annotations
-
 import json as json_text
 from collections.abc import Mapping
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The command `terrella score`."""
 
-from __future__ import annotations
-
 from tyro.conf import Positional
 
 from ..workflows import score as workflow

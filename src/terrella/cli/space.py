@@ -1,7 +1,5 @@
 """The commands `terrella space ...`: places of Gaussians, fitted to recordings, built, read from files, edited and exported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tyro.conf import Positional

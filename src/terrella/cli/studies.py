@@ -1,7 +1,5 @@
 """The commands `plan`, `evaluate`, `transfer` and `bench acceleration`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from tyro.conf import Positional, arg

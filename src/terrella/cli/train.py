@@ -1,7 +1,5 @@
 """The commands `terrella train ...`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The command `terrella train policy`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from tyro.conf import arg

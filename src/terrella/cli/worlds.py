@@ -1,7 +1,5 @@
 """The commands `terrella list` and `terrella convert-world`."""
 
-from __future__ import annotations
-
 import json as json_text
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The noise of an entry is a hash of (seed, stream, position): splitmix64 (Steele,
 generator (Salmon et al. 2011). So a batch of B equals B singles, and a frame can be rendered long after its step.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

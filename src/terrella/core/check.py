@@ -1,7 +1,5 @@
 """check_world: tests any World against the contract."""
 
-from __future__ import annotations
-
 import random
 import tempfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """as_env: any World as a Gymnasium vector environment."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

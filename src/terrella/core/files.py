@@ -3,8 +3,6 @@
 A new file is written under a hidden name beside its target, synced to the disk, and renamed over the target.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -5,8 +5,6 @@ Scale Multitask Learning", 2009; Bojanowski et al., "Enriching Word Vectors with
 same text is the same vector on every machine, texts that share words are near, and no model is needed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """The compiled kernel of chance.py; tests hold it against its slow, obvious twin."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

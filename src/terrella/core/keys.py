@@ -1,7 +1,5 @@
 """Default keyboard keys for named actions, and a user's own keys, action names and idle action."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

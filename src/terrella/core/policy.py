@@ -1,7 +1,5 @@
 """Policy: turns observations into actions. People, scripts, planners, networks and replays all have this interface."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 

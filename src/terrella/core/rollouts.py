@@ -1,7 +1,5 @@
 """rollout: steps a world under a policy or given actions, and collects its observations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass

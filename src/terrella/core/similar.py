@@ -1,7 +1,5 @@
 """Finds the known name that is most like a misspelt one, for messages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from difflib import get_close_matches
 

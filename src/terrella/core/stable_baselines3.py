@@ -1,7 +1,5 @@
 """as_sb3: any World as a vector environment of Stable-Baselines3."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The contract: a World is whatever has these four verbs, and every tool takes any World."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 

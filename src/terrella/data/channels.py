@@ -1,7 +1,5 @@
 """The features of a recording for the channels of a world, and back: `rgb.wrist` is observation.images.wrist."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

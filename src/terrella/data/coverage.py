@@ -1,7 +1,5 @@
 """Coverage: how much can be learned from a recording: how often its pictures change, which actions have an effect."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Dataset: reads any LeRobotDataset v3.0, local or remote, as plain arrays."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The features of a stranger's info.json: whether they can be, which Sensor each is, and the pictures that its rows keep."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Mapping

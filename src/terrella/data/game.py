@@ -1,7 +1,5 @@
 """Whether a recording and a world are of the same game."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

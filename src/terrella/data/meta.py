@@ -1,7 +1,5 @@
 """Reads the folder meta/ of a dataset: its facts, tasks and episodes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

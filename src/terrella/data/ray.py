@@ -3,8 +3,6 @@
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 # ray is an extra
 
-from __future__ import annotations
-
 import os
 import sys
 import uuid

@@ -1,7 +1,5 @@
 """record: steps any World under a policy and records what is observed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

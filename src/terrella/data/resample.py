@@ -1,7 +1,5 @@
 """resample: the readings of a sensor at other times, by a stated policy; row_times: the times of rows."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from typing import Literal, get_args

@@ -5,8 +5,6 @@ A `Source` is a recording in any format: its sensors and its takes. A `Take` is 
 between. Values are decoded when they are read, so a Source may be larger than memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """Minimum, maximum, mean, standard deviation and count of features, per episode and merged (meta/stats.json)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import numpy as np

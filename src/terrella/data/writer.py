@@ -1,7 +1,5 @@
 """Writer: puts whole episodes into a LeRobotDataset v3.0 folder, each in one step that a crash cannot halve."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

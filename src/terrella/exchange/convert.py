@@ -1,7 +1,5 @@
 """convert: from any format that Terrella knows into any other; the format of a path is recognised from its content."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module

@@ -5,8 +5,6 @@ a local browser could watch a robot's cameras. A gate in front of it admits only
 the server itself listens on a random loopback address.
 """
 
-from __future__ import annotations
-
 import asyncio
 import io
 import logging

@@ -1,7 +1,5 @@
 """Finds the numbers of a vector that are a pose on the ground."""
 
-from __future__ import annotations
-
 import re
 
 from ..data.source import Sensor

@@ -1,7 +1,5 @@
 """Budget: the time that the stages of a training run share, earlier runs included."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping

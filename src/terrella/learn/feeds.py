@@ -1,7 +1,5 @@
 """Feeds: what the trainer learns from. Random batches, or clips of a local or remote recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 

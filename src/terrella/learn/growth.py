@@ -3,8 +3,6 @@
 After automatic domain randomisation (OpenAI et al. 2019), with one scale for all parameters in place of two limits for each.
 """
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import torch

@@ -1,7 +1,5 @@
 """Batches for generators that see the last frames and actions alone, made of clips of a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

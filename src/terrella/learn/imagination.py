@@ -4,8 +4,6 @@ Rollouts begin in states that a recording leads to (`RecordedStarts`), or at the
 from batch to batch (`ContinuedEpisodes`); a simulator is practised in that way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass

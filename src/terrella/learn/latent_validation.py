@@ -1,8 +1,6 @@
 """Validation of a latent world on held-out episodes: open-loop errors beside two baselines, linear probes of its latents, and the
 calibration of its uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Losses of generated frames: against recorded frames, and by a critic that tells blur from detail."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import nn

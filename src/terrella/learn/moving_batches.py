@@ -1,7 +1,5 @@
 """Batches for generators of places in which things move (worlds/carried_frames.py)."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 import torch.nn.functional as F

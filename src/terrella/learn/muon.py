@@ -1,7 +1,5 @@
 """Muon: an optimiser with orthogonalised steps of weight matrices, so that all their directions are learned at one rate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

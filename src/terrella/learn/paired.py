@@ -1,7 +1,5 @@
 """Paired: a finished world with a recording on which its training continues."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A training run on disk: the state from which it resumes exactly, replaced as a whole at every save; and its log."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Strips: pictures of a held-out stretch of a recording above rollouts of worlds, to look at while they train."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Throughput of a world with fresh actions at each control step: imagined seconds per wall second, and energy."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

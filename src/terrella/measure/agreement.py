@@ -1,7 +1,5 @@
 """Agreement of two scorings of policies: Pearson, Spearman and the mean maximum rank violation of SIMPLER, with intervals."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Clips: windows of held-out recordings that every arm of a scorecard predicts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Loop closure: the camera goes away and comes back; does the world still show what it showed before?"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Its features are compared by `frechet`. It is not trained together with any worl
 it: a measure that is optimised no longer measures.
 """
 
-from __future__ import annotations
-
 import hashlib
 from functools import lru_cache
 from pathlib import Path

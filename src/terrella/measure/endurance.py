@@ -1,7 +1,5 @@
 """Endurance: rollouts of a thousand steps, played or idle; do sharpness and colours stay as in the real game?"""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Figures and curves of any error measure, compared with copy-last, other actions and no action; and drift."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The whole examination in one call: every probe on every arm, with results stored as they come."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Similarity of pictures (PSNR, SSIM) and their appearance (gradient energy, colour statistics)."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -12,8 +12,6 @@ groups (clips), from both sets at once: the jackknife (Quenouille 1956, Tukey 19
 interval. A corrected value may be slightly below 0 if the sets are alike.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

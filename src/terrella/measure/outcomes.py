@@ -1,7 +1,5 @@
 """Outcomes: predictions of reward, of single numbers such as health, and of the end of the episode."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

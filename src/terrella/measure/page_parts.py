@@ -1,7 +1,5 @@
 """Parts of the page of a scorecard: sections, charts, tables of figures, pictures."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Pixels, of every camera: PSNR, SSIM, sharpness, change per step, and Frechet distance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

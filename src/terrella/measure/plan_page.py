@@ -1,7 +1,5 @@
 """The results of `terrella plan` to look at: a film of reality beside the dream with their divergence, and a page of figures."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping, Sequence
 from html import escape

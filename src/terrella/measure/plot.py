@@ -1,7 +1,5 @@
 """Small SVG line charts with interval bands, for a dark page, legible on a phone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Small SVG plots of points with intervals: scatter plots and dot plots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

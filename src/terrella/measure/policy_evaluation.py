@@ -1,7 +1,5 @@
 """Policy evaluation in a learned world (the dream) against reality: scores, rank agreement, and a verdict in sentences."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The page of `terrella evaluate`: the verdict, dream against reality, each policy, and the growth of the dream's error."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from html import escape
 

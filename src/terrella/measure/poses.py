@@ -1,7 +1,5 @@
 """Pose: the drift of the world's camera poses from the truth, in metres, radians, and relative to the path length."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

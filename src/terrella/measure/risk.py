@@ -5,8 +5,6 @@ Frames are ordered by the world's `uncertainty`; the risk at coverage c is the m
 order gives the mean error; the order by the error itself (oracle) the least area.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

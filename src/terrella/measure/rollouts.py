@@ -1,7 +1,5 @@
 """Rollouts of a world from clips, under recorded actions or along true poses, with metrics of each step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The scorecard as data: figures with 95% intervals and baselines, curves, pictures, and probes that do not apply."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Speed: milliseconds of one imagined and rendered step of a single rollout, and their growth over time."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

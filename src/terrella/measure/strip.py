@@ -1,7 +1,5 @@
 """Strips of pictures: rows of frames with labels."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 

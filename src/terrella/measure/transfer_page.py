@@ -1,7 +1,5 @@
 """The page of `terrella transfer`: the verdict, each arm, success against real episodes and against the gap, and the method."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """Sim-to-real transfer of policies: success rates of each arm, the share of the gap that it recovers, and a verdict."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The actions that turn the camera or scroll the picture, from trials or recordings, not from their names."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import combinations

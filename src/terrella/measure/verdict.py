@@ -1,7 +1,5 @@
 """The verdict of a scorecard, computed from figures and their intervals: one sentence, then lines; and the card as JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

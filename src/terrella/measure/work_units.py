@@ -1,7 +1,5 @@
 """Work in units whose results are stored as they are done, so that it can resume, with a forecast of the time left."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence

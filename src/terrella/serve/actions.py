@@ -1,7 +1,5 @@
 """The input of a page as actions of a world: keys that are held, and the axes of sticks, mouse and sliders."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

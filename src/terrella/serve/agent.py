@@ -1,7 +1,5 @@
 """Agents that may drive in place of the person at the page: policies with a name, a goal, and the futures that they consider."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ Channels decide, not the kind of world. With `pose` and `places` [N, 4] (x, y in
 `known` [H, W] in 0..1 its pictures can be tinted.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 

@@ -1,7 +1,5 @@
 """The recent past as an MP4: the JPEGs of a moment side by side, enlarged by whole factors."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from fractions import Fraction

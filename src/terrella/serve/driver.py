@@ -1,7 +1,5 @@
 """Who acts in a timeline: the person at the page, or an agent that drives until the person touches the controls."""
 
-from __future__ import annotations
-
 import math
 import sys
 import time

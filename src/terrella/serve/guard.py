@@ -1,7 +1,5 @@
 """Access to the server: host and origin checks, the token, rate limits, and the headers of every page."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac

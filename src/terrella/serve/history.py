@@ -1,7 +1,5 @@
 """The recent past of a session, within fixed budgets: pictures to show, and states to go back to."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace

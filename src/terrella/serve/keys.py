@@ -1,7 +1,5 @@
 """The keys and names of a world's actions, as a page shows them and as a person changes them there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 

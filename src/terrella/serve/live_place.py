@@ -1,7 +1,5 @@
 """The page of a place while it is being fitted: it shows the newest state, and the fit never waits for it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import threading

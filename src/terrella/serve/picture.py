@@ -1,7 +1,5 @@
 """Image files from the disk or the page, as frames of the world's size."""
 
-from __future__ import annotations
-
 import base64
 import io
 from pathlib import Path

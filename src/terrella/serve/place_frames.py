@@ -1,7 +1,5 @@
 """Frames of a place, rendered on the server for browsers that cannot."""
 
-from __future__ import annotations
-
 import json
 import math
 import threading

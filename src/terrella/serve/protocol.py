@@ -1,7 +1,5 @@
 """The one WebSocket's language: binary frames to the page, small JSON messages both ways."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

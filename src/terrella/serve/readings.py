@@ -1,7 +1,5 @@
 """Encodings of sensor readings for the page of a recording: JPEG, half-float depth, points, and series at screen resolution."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

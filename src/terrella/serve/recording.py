@@ -1,7 +1,5 @@
 """Play as rows of a dataset: each observation with the action, reward and end that followed it."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping
 from typing import Protocol

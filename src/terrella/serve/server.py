@@ -1,7 +1,5 @@
 """The server of a world's page: the page, its one WebSocket, clips to download, and the sessions behind them."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

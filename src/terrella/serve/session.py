@@ -1,7 +1,5 @@
 """A session: one person's timeline, paced by the world's clock and by the frames that their browser has acknowledged."""
 
-from __future__ import annotations
-
 import asyncio
 import secrets
 import sys

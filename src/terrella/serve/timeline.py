@@ -1,7 +1,5 @@
 """A timeline: one world, or a game with a learned world beside it, with its past and its recording."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

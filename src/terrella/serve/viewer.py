@@ -1,7 +1,5 @@
 """The page of a recording: its readings, marks for bad episodes, and the export of the good ones."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

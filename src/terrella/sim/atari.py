@@ -1,7 +1,5 @@
 """Atari games (ale-py) with the usual preprocessing: frame skip, small pictures, exact copies of the console's state."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import ale_py

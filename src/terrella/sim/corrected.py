@@ -5,8 +5,6 @@ neural-augmented simulation, Golemo et al. 2018). Backlash is an input as a bank
 of hysteresis), because few episodes do not teach a network such a long memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ masks everything that may move or vanish (monsters, shots, pick-ups, doors, lift
 position of each sprite, `instances` its pixels.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

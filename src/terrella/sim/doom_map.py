@@ -1,7 +1,5 @@
 """A Doom map as geometry: the maps of a WAD, and exact depth by ray casting its sectors."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections import Counter

@@ -1,7 +1,5 @@
 """What a Gymnasium environment declares about itself: names and keys of its actions, its frame rate."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

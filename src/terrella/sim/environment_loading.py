@@ -1,7 +1,5 @@
 """Makes Gymnasium environments, and explains in one sentence why one cannot be made, reset or rendered."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

@@ -1,7 +1,5 @@
 """System identification: the parameters of a randomised world under which it reproduces a robot's trials best."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

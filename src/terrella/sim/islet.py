@@ -3,8 +3,6 @@
 terrella play gym:Islet-v0
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """The art of Islet (sim/islet.py): its palette, sprites and island, painted once."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The compiled kernel of doom_map.py: depth of a map of prisms from a camera."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -2,8 +2,6 @@
 
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import copy
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence

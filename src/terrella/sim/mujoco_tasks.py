@@ -1,7 +1,5 @@
 """Tasks of MuJoCo robots: initial states, reward, termination and observations, for whole batches at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol

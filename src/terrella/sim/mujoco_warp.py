@@ -2,8 +2,6 @@
 
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

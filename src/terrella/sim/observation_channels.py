@@ -1,7 +1,5 @@
 """The channels in the observations of a Gymnasium environment: pictures of any layout, and entries of a Dict."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Perceived: a World around a World, in which policies see a goal that an encoder estimates from a picture."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Parallel episodes of an environment that cannot be copied, each in its own process."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import signal

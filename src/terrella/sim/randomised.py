@@ -1,7 +1,5 @@
 """Domain randomisation: a World around a World, whose episodes draw masses, friction, delay, light, … at random."""
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

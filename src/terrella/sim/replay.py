@@ -1,7 +1,5 @@
 """A recorded episode as a World: it shows the recorded frames in order, whatever the action."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

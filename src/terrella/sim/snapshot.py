@@ -5,8 +5,6 @@ numeric array. Text and nested containers must not change. An environment with a
 file, its own random generator) is refused, because a copy would be incomplete.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from types import FunctionType

@@ -1,7 +1,5 @@
 """WorldWrapper: the base class of worlds around worlds."""
 
-from __future__ import annotations
-
 from typing import Generic, TypeVar
 
 from ..core.world import World
@@ -12,8 +10,7 @@ Inner = TypeVar("Inner", bound=World)
 class WorldWrapper(Generic[Inner]):
     """A World around another one, as gymnasium.Wrapper is."""
 
-    world: Inner
-    """The world inside."""
+    world: Inner  # The world inside.
 
     def close(self) -> None:
         close = getattr(self.world, "close", None)

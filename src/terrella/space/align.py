@@ -4,8 +4,6 @@ Dense visual odometry (Steinbruecker et al. 2011; Kerl et al. 2013) with three u
 brightness, coarse to fine, with robust weights for outliers (occlusions, moving objects).
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

@@ -4,8 +4,6 @@ A billboard has a place, that of its feet (x, y, z in metres, world frame), a pi
 and a box [4], its extent to the left, to the right, below and above its feet, in metres across the line of sight.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ Frames: world z up; camera x forward, y left, z up. A pose is float32 [..., 7]: 
 w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H).
 """
 
-from __future__ import annotations
-
 import torch
 
 Intrinsics = tuple[float, float, float, float]

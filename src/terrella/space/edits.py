@@ -14,8 +14,6 @@ The page edits with the same language (serve/web/place/edits.js). Both compute p
 single, so that they choose the same Gaussians.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,8 +1,6 @@
 """Estimator: what a picture alone says of space: how far everything is, how the viewer moved since the one before, and whether
 it looks like the pictures that it learned from. Trained by learn/objectives/estimator.py."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

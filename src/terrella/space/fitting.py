@@ -56,16 +56,11 @@ def resize_depth(depth: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 class FitConfig:
     """Settings of the optimisation."""
 
-    gaussians: int = 40_000
-    """Gaussians, at most."""
-    steps: int = 2000
-    """Steps of gradient descent, one picture each."""
-    degree: int = 0
-    """Degree of the spherical harmonics of colours, 0 to 3."""
-    depth_weight: float = 0.05
-    """Weight of the relative depth error, beside the error of colours in 0..1."""
-    seed: int = 0
-    """Seed of the order of the pictures."""
+    gaussians: int = 40_000  # Gaussians, at most.
+    steps: int = 2000  # Steps of gradient descent, one picture each.
+    degree: int = 0  # Degree of the spherical harmonics of colours, 0 to 3.
+    depth_weight: float = 0.05  # Weight of the relative depth error, beside the error of colours in 0..1.
+    seed: int = 0  # Seed of the order of the pictures.
 
     def __post_init__(self):
         if self.gaussians < 100 or self.steps < 1 or self.degree not in range(4):

@@ -3,8 +3,6 @@
 World frame, metres; a body is an axis-aligned upright box, as in Doom and Quake.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

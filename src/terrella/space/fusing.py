@@ -3,8 +3,6 @@
 The weight of each Gaussian at each pixel is the gradient of the picture by its colour, so that one rendering gives all sums.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

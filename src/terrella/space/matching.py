@@ -1,8 +1,6 @@
 """Motion between consecutive pictures by displacements ("moves", x and y in whole pixels): which of them explain a pixel, and
 by which most of a picture scrolls."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

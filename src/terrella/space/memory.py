@@ -5,8 +5,6 @@ what it held of that view. When it is full it forgets the keyframe whose view th
 evidence alone), and of equals a dreamt one before an observed one, the oldest first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Meshes of places: fused from the depth of views all around (TSDF, Curless and Levoy 1996), or of what stops bodies."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Its middle is the current picture. Each of its pixels holds the colour that most
 Moore 1981), so that objects in front of the background leave no trace.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

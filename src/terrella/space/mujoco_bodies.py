@@ -3,8 +3,6 @@
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
 
-from __future__ import annotations
-
 import threading
 
 import mujoco

@@ -6,8 +6,6 @@ Compiled kernels do both on a CPU (kernels_numba/surfaces.py); `patches_slowly` 
 the way on a GPU.
 """
 
-from __future__ import annotations
-
 import torch
 
 from .camera import FAR_M, NEAR_M, Intrinsics, rays, rotation, unproject

@@ -5,8 +5,6 @@ reconstruct, where it is sparse the inner world's invention stays; the two are b
 blend, so that it goes on from it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ Depth is splatted forward (which surface does each pixel of the new view see?), 
 bilinear sampling, so textures come over sharp and without holes. Keyframes that see another surface there are masked.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 

@@ -3,8 +3,6 @@
 World frame, metres, z up. A walker is an upright cylinder; its place is the position of its eye.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

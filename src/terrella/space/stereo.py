@@ -3,8 +3,6 @@
 Locally normalised pictures are compared in small windows. Depths that no other picture confirms are left out.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Runs kernels that release the GIL over the views of a batch, on several threads."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

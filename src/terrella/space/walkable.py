@@ -1,7 +1,5 @@
 """The cells that a walker can reach: a flood fill over floors, stopped by walls, edges and high steps."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import torch

@@ -1,7 +1,5 @@
 """`measure_acceleration`: how much faster than time a world imagines, beside a simulator of the same task."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

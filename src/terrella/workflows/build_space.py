@@ -1,7 +1,5 @@
 """Makes places of Gaussians: fitted to a recording or pictures, built of words, a layout or triangles, or read from a file."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import warnings
@@ -39,12 +37,9 @@ class BuildSpaceConfig:
 
     text: str | None = None
     """Words instead of a layout: "a long room with two pillars and a red door". Their layout is saved as OUT/layout.json."""
-    gaussians: int = 120_000
-    """About how many Gaussians."""
-    seed: int | None = None
-    """Seed of everything that the words or the layout leave open."""
-    size: tuple[int, int] = (192, 256)
-    """Height and width of the pictures, in pixels."""
+    gaussians: int = 120_000  # About how many Gaussians.
+    seed: int | None = None  # Seed of everything that the words or the layout leave open.
+    size: tuple[int, int] = (192, 256)  # Height and width of the pictures, in pixels.
 
 
 @dataclass(frozen=True)
@@ -54,10 +49,8 @@ class ImportSpaceConfig:
     axes: Literal["rdf", "rub", "flu"] | None = None
     """Axes of the file: rdf (x right, y down, z forward: usual in .ply), rub (x right, y up, z back: usual in .spz), or flu
     (x forward, y left, z up: Terrella's)."""
-    scale: float = 1.0
-    """Metres per unit of the file."""
-    size: tuple[int, int] = (192, 256)
-    """Height and width of the pictures, in pixels."""
+    scale: float = 1.0  # Metres per unit of the file.
+    size: tuple[int, int] = (192, 256)  # Height and width of the pictures, in pixels.
 
 
 def fit_space(

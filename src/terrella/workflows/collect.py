@@ -1,7 +1,5 @@
 """`collect`: a policy's or a person's episodes of a world become a recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The compute curve of `plan`: the same starts with ever fewer plans, or less time, per decision. Does thinking longer help?"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Changes a part of a place of Gaussians, merges another place into it, or takes edits back. The scene itself stays as it was."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,32 +24,20 @@ class EditSpaceConfig:
 
     box: tuple[float, float, float, float, float, float] | None = None
     """Select the box between two corners (x y z x y z, metres). Without a selection all is selected."""
-    sphere: tuple[float, float, float, float] | None = None
-    """Select the sphere around a point (x y z radius, metres)."""
-    plane: tuple[float, float, float, float] | None = None
-    """Select one side of a plane (a b c d: a x + b y + c z > d)."""
-    object: int | None = None
-    """Select the object with this number (`space view` shows it)."""
-    move: Triple | None = None
-    """Move by x y z metres."""
-    duplicate: Triple | None = None
-    """Add a copy that is moved by x y z metres."""
-    turn: float | None = None
-    """Turn to the left about its middle, in degrees."""
-    scale: float | None = None
-    """Scale about its middle by this factor."""
-    recolour: Triple | None = None
-    """Paint in one colour (red green blue, 0 to 1)."""
-    delete: bool = False
-    """Delete the selection."""
+    sphere: tuple[float, float, float, float] | None = None  # Select the sphere around a point (x y z radius, metres).
+    plane: tuple[float, float, float, float] | None = None  # Select one side of a plane (a b c d: a x + b y + c z > d).
+    object: int | None = None  # Select the object with this number (`space view` shows it).
+    move: Triple | None = None  # Move by x y z metres.
+    duplicate: Triple | None = None  # Add a copy that is moved by x y z metres.
+    turn: float | None = None  # Turn to the left about its middle, in degrees.
+    scale: float | None = None  # Scale about its middle by this factor.
+    recolour: Triple | None = None  # Paint in one colour (red green blue, 0 to 1).
+    delete: bool = False  # Delete the selection.
     merge: str | None = None
     """Add all of this other world of Gaussians. --turn first turns it about its origin, --move then moves it."""
-    undo: bool = False
-    """Undo the last edit."""
-    redo: bool = False
-    """Redo the edit that was undone last."""
-    replay: Path | None = None
-    """Replace the edits by those of this file (one that the page saved)."""
+    undo: bool = False  # Undo the last edit.
+    redo: bool = False  # Redo the edit that was undone last.
+    replay: Path | None = None  # Replace the edits by those of this file (one that the page saved).
 
     @property
     def selection(self) -> dict[str, Any]:

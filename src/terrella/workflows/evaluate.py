@@ -1,7 +1,5 @@
 """`evaluate`: evaluates policies in a world and, where there is one, in the real environment, and measures how far both agree."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """The episodes of an evaluation so far, kept in evaluate.json, so that a stopped evaluation continues."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

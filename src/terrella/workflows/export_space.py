@@ -1,7 +1,5 @@
 """Writes a place for other tools: Gaussians (PLY, SPZ, GLB), a mesh (GLB), a panorama (PNG), a film (MP4) or a page (HTML)."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -46,18 +44,13 @@ MOST_FACES = 5_000_000
 class ExportSpaceConfig:
     """How a place is written."""
 
-    axes: Literal["rdf", "rub", "flu"] | None = None
-    """Axes of the file; default: rdf for .ply and rub for .spz."""
-    compressed: bool = False
-    """Write SuperSplat's compressed form of .ply."""
-    spz: Version = 3
-    """Version of an .spz: 3, which Spark opens, or 4, which PlayCanvas' engine opens."""
+    axes: Literal["rdf", "rub", "flu"] | None = None  # Axes of the file; default: rdf for .ply and rub for .spz.
+    compressed: bool = False  # Write SuperSplat's compressed form of .ply.
+    spz: Version = 3  # Version of an .spz: 3, which Spark opens, or 4, which PlayCanvas' engine opens.
     kind: Literal["mesh", "collider", "gaussians"] = "mesh"
     """Content of a .glb: a mesh with colours, the mesh that stops bodies, or the Gaussians (KHR_gaussian_splatting)."""
-    cell: float = 0.05
-    """Size of a cell of the mesh, in metres."""
-    seconds: float = 8.0
-    """Duration of the film, in seconds."""
+    cell: float = 0.05  # Size of a cell of the mesh, in metres.
+    seconds: float = 8.0  # Duration of the film, in seconds.
     path: Path | None = None
     """Path of the film: a JSON list of [x, y, z, degrees]. Default: a look around from each start."""
 

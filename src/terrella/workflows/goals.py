@@ -1,7 +1,5 @@
 """Goals as a person writes them: a picture file, numbers, CHANNEL=VALUE, or the word reward."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Keeps the keys that a person sets on the page."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

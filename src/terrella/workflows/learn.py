@@ -1,7 +1,5 @@
 """`learn`: from an environment's id to a playable world with a scorecard, within a number of minutes."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

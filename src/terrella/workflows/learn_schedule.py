@@ -1,7 +1,5 @@
 """The schedule of `learn`: how its minutes are divided among its stages, and what is done of it, kept in a file."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

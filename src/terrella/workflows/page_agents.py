@@ -1,7 +1,5 @@
 """The agent that acts on the page instead of a person: by its name, or the one that suits the world."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property

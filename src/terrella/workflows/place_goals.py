@@ -1,7 +1,5 @@
 """Goals that are places, for `plan`: a pose, where a picture was taken, or views of a recording far from the start."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

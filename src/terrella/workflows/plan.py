@@ -1,7 +1,5 @@
 """`plan`: reaches a goal in a real environment by planning in a world, beside acting at random."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

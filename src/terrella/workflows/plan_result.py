@@ -1,7 +1,5 @@
 """The result of `plan`: figures of the episodes, sentences about them, a page, and a film of dream and reality side by side."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

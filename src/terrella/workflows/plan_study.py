@@ -1,7 +1,5 @@
 """What `plan` plays: the worlds, opened and checked, and the planner in them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial

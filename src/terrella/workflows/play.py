@@ -1,7 +1,5 @@
 """Serves the page of a world, or of a game and a learned world side by side, with an agent that may drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,31 +26,25 @@ from .progress import Progress, silent
 class PlayConfig:
     """How a world is played."""
 
-    image: Path | None = None
-    """Start from this picture (any image file). Pictures can also be dropped on the page."""
+    image: Path | None = None  # Start from this picture (any image file). Pictures can also be dropped on the page.
     compare: bool = False
     """Show the real game beside the learned world, under the same actions. --truth GAME names the game."""
     truth: str | None = None
     """The real game that --compare shows; default: the game that the world learned, else doom:my_way_home."""
-    memory: bool = True
-    """Play a learned world without its keyframes."""
-    remember: bool = False
-    """Add a spatial memory to a world that has none."""
+    memory: bool = True  # Play a learned world without its keyframes.
+    remember: bool = False  # Add a spatial memory to a world that has none.
     estimator: str | None = None
     """Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one."""
-    memory_mb: float | None = None
-    """Size limit of the spatial memory in MiB; default: as the world was saved, or 16."""
+    memory_mb: float | None = None  # Size limit of the spatial memory in MiB; default: as the world was saved, or 16.
     randomise: Path | None = None
     """A TOML or JSON file of distributions, from which each episode draws masses, friction, delay and more."""
     agent: str = ""
     """Who drives if the page lets it: plan, explorer, random, the folder of a learned policy, or MODULE:NAME; default: a planner
     if the world has a reward, else the explorer. A planner seeks the goals that are set on the page."""
-    agent_ms: float = 30.0
-    """Time for a planner's decision, in milliseconds."""
+    agent_ms: float = 30.0  # Time for a planner's decision, in milliseconds.
     policy: Literal["explore", "random"] | None = None
     """A script that acts from the beginning, whenever nobody touches the controls."""
-    record: Path | None = None
-    """Folder of a dataset to which the page can record."""
+    record: Path | None = None  # Folder of a dataset to which the page can record.
     device: Device = "auto"
     fast: Fast = False
 

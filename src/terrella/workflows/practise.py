@@ -5,8 +5,6 @@ Every stage continues where it was stopped, and the rounds that are over are not
 A round's practice begins with the policy of the highest return so far; the better one of that and the last is the result.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The progress of long work: one line a call, with the time left; a bar where stderr is a terminal."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterator

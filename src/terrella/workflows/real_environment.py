@@ -1,7 +1,5 @@
 """Opens the real environment that belongs to a world, and checks that both have the same actions, clock and observations."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

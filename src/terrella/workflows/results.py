@@ -1,7 +1,5 @@
 """What every workflow returns: a frozen result that can be printed, or written as JSON."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

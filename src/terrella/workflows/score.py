@@ -1,7 +1,5 @@
 """`score`: is a world better than copying the last frame, and how far can it be trusted?"""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import shutil

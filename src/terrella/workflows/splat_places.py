@@ -1,7 +1,5 @@
 """Opens places of Gaussians by name, as worlds and as the content of their pages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,10 +29,8 @@ from ..worlds.splat_folder import (
 class SpaceResult:
     """What a command made of a place."""
 
-    facts: Mapping[str, Any]
-    """Figures, names and paths, as JSON has them."""
-    lines: tuple[str, ...] = field(default=())
-    """The same for people."""
+    facts: Mapping[str, Any]  # Figures, names and paths, as JSON has them.
+    lines: tuple[str, ...] = field(default=())  # The same for people.
 
     def to_json(self) -> dict[str, Any]:
         return dict(self.facts)

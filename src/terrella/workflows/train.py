@@ -1,7 +1,5 @@
 """`train_video` and `train_latent`: a recording becomes a world."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

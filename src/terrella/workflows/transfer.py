@@ -1,7 +1,5 @@
 """`transfer`: transfers policies from a simulator to a "real" robot that differs, and measures which methods help."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """One seed of `transfer`: trains every arm and tests it on the real robot. Results are saved at once, so that it continues."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from functools import reduce

@@ -1,7 +1,5 @@
 """Encoders for `transfer --camera`: they read the goal off a picture, and policies are shown that goal."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path

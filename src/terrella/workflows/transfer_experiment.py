@@ -1,7 +1,5 @@
 """What an experiment of `transfer` is: the simulator, the "real" robot and how it differs, opened, checked and fingerprinted."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """`transfer` with a recording as reality: open-loop errors of the simulator, and the agreement of actions."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping

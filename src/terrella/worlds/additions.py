@@ -1,7 +1,5 @@
 """Additions: how the pictures that an episode saw changed its place, as rows of an arena that its State points at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import final

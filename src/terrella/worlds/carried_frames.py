@@ -3,8 +3,6 @@
 Keyframes hold what stands still; monsters, shots and doors are known from the last frames alone.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -5,8 +5,6 @@ swaps all of it in one step, after which files that nothing names are removed. A
 also when the writer is killed at any point.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -5,8 +5,6 @@ choice, never an average, so nothing fades), or is painted in a colour of the re
 pointer-generator mixture (See et al. 2017) over the block moves of the recording (learn/moves.py finds them).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 

@@ -1,7 +1,5 @@
 """The settings of a world of pictures, and those of its parts that follow from them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ..space.camera import Intrinsics

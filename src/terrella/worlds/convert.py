@@ -1,7 +1,5 @@
 """convert_world: a world folder of format version 2 (one config for all, weights by older names) as one of version 3."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any

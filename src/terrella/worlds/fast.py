@@ -3,8 +3,6 @@
 The graph is made in memory when the world is loaded; nothing is stored and nothing unpickled.
 """
 
-from __future__ import annotations
-
 import copy
 import statistics
 import threading

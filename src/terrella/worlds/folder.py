@@ -4,8 +4,6 @@ world.json names each part's kind and settings; the weights are tensors named PA
 and zlib-packed uint16 millimetres (depth); nothing is ever unpickled. A folder is replaced as a whole (checkpoint.py).
 """
 
-from __future__ import annotations
-
 import json
 import zlib
 from collections.abc import Callable, Mapping

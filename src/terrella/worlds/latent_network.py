@@ -1,7 +1,5 @@
 """The networks of a latent world: encoder, predictor, heads and, for people, a decoder (LeWorldModel, Maes et al. 2026)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Localisation: the pose and depth of an episode that begins with one picture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import final
 

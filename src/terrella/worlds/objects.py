@@ -4,8 +4,6 @@ Looks (space/billboards.py) and moves are those that the recording showed. The n
 network: a figure is never a mean of what it could do, so it stays sharp.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, final

@@ -8,8 +8,6 @@ which is falsy and adds nothing to a state.
 
 # the methods of a Protocol are their docstrings
 # pyright: reportReturnType=false
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable

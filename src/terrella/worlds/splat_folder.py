@@ -1,7 +1,5 @@
 """A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import io

@@ -4,8 +4,6 @@ One small network beside the generator, no ensemble: from the conditioning, the 
 evidence, it predicts the mean absolute error that such frames had.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final

@@ -1,7 +1,5 @@
 """The largest search that fits a time budget, and whether a cost tells plans apart at all."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

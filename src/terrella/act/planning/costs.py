@@ -1,7 +1,5 @@
 """The cost of a plan: the distance to a goal in any channels, or the negative reward."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal

@@ -1,7 +1,5 @@
 """Episodes of a policy in a world: their return, whether they succeeded, and how long each decision took."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

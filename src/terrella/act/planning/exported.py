@@ -1,7 +1,5 @@
 """A world as the cost model of other planners: stable-worldmodel's solvers, and any that call `get_cost`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, final
 

@@ -1,7 +1,5 @@
 """A simulator whose whole state is observed, so that a planner starts from the state of the real episode."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """GoalBeliefPolicy: a goal-conditioned policy that acts on a world's latent, without a search."""
 
-from __future__ import annotations
-
 from typing import final
 
 import torch

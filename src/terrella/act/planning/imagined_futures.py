@@ -1,7 +1,5 @@
 """The plans that a planner considered, imagined once more so that a person can see their outcomes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

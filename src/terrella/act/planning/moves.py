@@ -5,8 +5,6 @@ the number of each choice. The sampling distribution of a search is a tensor [B,
 continuous action (K = 2), or the probabilities of K choices. It is called `belief`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

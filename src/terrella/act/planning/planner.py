@@ -1,7 +1,5 @@
 """Planner: model-predictive control in any World. It imagines candidate plans, and takes the first actions of the cheapest."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """One planning problem of several episodes: the costs of candidate plans, as a world imagines them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Routes to a place beyond a planner's horizon, over places where a camera has been or where one can stand."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from dataclasses import dataclass, field, replace

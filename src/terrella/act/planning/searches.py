@@ -32,12 +32,9 @@ class SearchConfig:
     search: Kind = "icem"
     samples: int = 0
     """Candidate plans per round. 0 means 64, or 32 to walk to a place. A tree expands samples x iterations moves per depth."""
-    iterations: int = 0
-    """Rounds per decision. 0 means 5, or 1 to walk to a place."""
-    horizon: int = 0
-    """Moves per plan. 0 means 12, or 4 to walk to a place."""
-    block: int = 0
-    """Environment steps for which each move is held. 0 means 1 step, or 0.115 s to walk to a place."""
+    iterations: int = 0  # Rounds per decision. 0 means 5, or 1 to walk to a place.
+    horizon: int = 0  # Moves per plan. 0 means 12, or 4 to walk to a place.
+    block: int = 0  # Environment steps for which each move is held. 0 means 1 step, or 0.115 s to walk to a place.
     replan: int = 0
     """Moves that are executed before the next plan is made. 0 means 1, or the whole plan with the cost `last`."""
     # Milliseconds per decision, in place of `iterations`; at least one round is done. Results then depend on the speed of the
@@ -48,18 +45,12 @@ class SearchConfig:
     trust: float | None = None
     elites: int = 0
     """Best candidates of a round, to which the sampling distribution is fitted. 0 means an eighth of the samples."""
-    spread: float = 0.5
-    """Initial standard deviation of an action axis, as a share of half its range."""
-    momentum: float = 0.1
-    """Weight of the old sampling distribution when it is fitted to the elites."""
-    colour: float = 2.0
-    """Exponent of the power spectrum of icem's noise: 0 is white, 2 is red."""
-    keep: float = 0.3
-    """Share of icem's elites that are tried again in the next round."""
-    decay: float = 1.25
-    """Factor by which icem's samples shrink per round."""
-    temperature: float = 0.5
-    """Temperature of mppi, as a share of the range of the elites' costs."""
+    spread: float = 0.5  # Initial standard deviation of an action axis, as a share of half its range.
+    momentum: float = 0.1  # Weight of the old sampling distribution when it is fitted to the elites.
+    colour: float = 2.0  # Exponent of the power spectrum of icem's noise: 0 is white, 2 is red.
+    keep: float = 0.3  # Share of icem's elites that are tried again in the next round.
+    decay: float = 1.25  # Factor by which icem's samples shrink per round.
+    temperature: float = 0.5  # Temperature of mppi, as a share of the range of the elites' costs.
 
     def __post_init__(self):
         counts = (self.samples, self.iterations, self.horizon, self.block, self.replan, self.elites)

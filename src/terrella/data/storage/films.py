@@ -1,7 +1,5 @@
 """Videos as packets: which frames a file holds, and cutting it, where possible without encoding it again."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from contextlib import suppress

@@ -4,8 +4,6 @@ A record is its length, the CRC-32 of its payload, and the payload: sensor numbe
 first record that is cut or does not match its checksum, so a torn tail loses that record alone.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

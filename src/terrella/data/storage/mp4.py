@@ -3,8 +3,6 @@
 The boxes of a file are checked before FFmpeg allocates memory for the frames that they claim.
 """
 
-from __future__ import annotations
-
 import os
 import queue
 import struct

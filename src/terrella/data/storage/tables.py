@@ -4,8 +4,6 @@ Reading the metadata of a column of a damaged file (`metadata.row_group(i).colum
 chosen by the values of their column "index". Reading in batches bounds what a file unpacks to.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

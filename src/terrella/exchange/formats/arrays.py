@@ -4,8 +4,6 @@ A format lists the arrays of an episode (`Array`, by place) and says what the fi
 `columns` makes sensors of them, `readings` the readings of a take, and `source` the whole source.
 """
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """Reads the Counter-Strike deathmatch recordings that DIAMOND was trained on (Pearce and Zhu, arXiv:2104.04258)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """D4RL's flat HDF5 arrays (observations, actions, rewards, terminals, timeouts), split into episodes when read."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Rollouts of a Gymnasium environment under random actions, made when they are read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Folders of videos or images: which take and camera each file belongs to, and the names that writers use."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 

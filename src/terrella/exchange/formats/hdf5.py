@@ -1,7 +1,5 @@
 """HDF5 recordings as Sources: robomimic's layout, DIAMOND's Counter-Strike files, D4RL's flat arrays."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Reads and writes HDF5 files without trusting them: links out of the file, false sizes and damage are refused."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Folders of images without actions, read, and written as PNG."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

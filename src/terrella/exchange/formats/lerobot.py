@@ -1,7 +1,5 @@
 """LeRobot v3.0: reads a dataset as a Source, and writes any Source as one, resampled to rows."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ the exact start time) is in the file's metadata records "terrella.source", "terr
 without them is read as well. Foxglove has no message for an IMU: it is a vector, as all plain numbers are.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping

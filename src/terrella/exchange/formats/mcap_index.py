@@ -4,8 +4,6 @@ The package's own reader stops at the first damage and gives no access by number
 so that a damaged record costs only itself. Layout: https://mcap.dev/spec.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import struct

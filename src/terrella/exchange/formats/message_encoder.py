@@ -1,7 +1,5 @@
 """Encodes sensor readings as Foxglove messages (Protobuf) with Foxglove's SDK."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Mapping
 from functools import cache

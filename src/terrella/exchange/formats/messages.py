@@ -1,7 +1,5 @@
 """Foxglove's well-known messages, JSON and any Protobuf, as they stand in an MCAP file: a message becomes a reading."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import io

@@ -4,8 +4,6 @@ The package decodes whole episodes at once and makes the environment that the me
 so they are read here one value at a time, and no code that they name is run.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

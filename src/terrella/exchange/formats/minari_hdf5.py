@@ -1,7 +1,5 @@
 """One episode of Minari's main_data.hdf5."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How Minari stores an episode: as a group of main_data.hdf5, or as a folder with an Arrow or Parquet table."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Shows a recording in the viewer of Rerun (https://rerun.io)."""
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

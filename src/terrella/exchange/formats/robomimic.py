@@ -1,7 +1,5 @@
 """robomimic's HDF5 layout: data/demo_i/{actions, obs/*, next_obs/*, states, rewards, dones}, read and written."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping

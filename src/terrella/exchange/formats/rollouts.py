@@ -1,7 +1,5 @@
 """Folders of .npz episodes, one rollout each: read and written."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections import Counter

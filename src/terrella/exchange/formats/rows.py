@@ -1,7 +1,5 @@
 """Arrays with a row per step as sensors, and back: shared by the formats that store episodes as rows."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

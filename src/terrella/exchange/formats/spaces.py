@@ -1,7 +1,5 @@
 """Gymnasium spaces as JSON, as Minari spells it, and the arrays and texts that they flatten into."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

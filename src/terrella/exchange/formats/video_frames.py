@@ -1,7 +1,5 @@
 """Video frames by number; and H.264 and H.265 streams with one frame per message."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Folders of videos without actions, read with their true frame times, and written."""
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

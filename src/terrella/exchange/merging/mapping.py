@@ -1,7 +1,5 @@
 """The mapping of a merge: which number of each robot fills which merged number; and its checks."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The mapping of a merge as a commented TOML file, for a person to edit."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass

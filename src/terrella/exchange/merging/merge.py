@@ -20,8 +20,6 @@ The instruction and the facts of a take are kept; start_ns moves to the first ro
 are not finite, also as float32, are masked. A take with fewer than two rows is skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Proposes the mapping of a merge, as far as names, units and frames allow; a person completes it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

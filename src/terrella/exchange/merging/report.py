@@ -1,7 +1,5 @@
 """The report of a merge: rows and gaps of every source, what was left out, each robot's statistics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 

@@ -1,7 +1,5 @@
 """Conversion between units of one quantity: "deg" -> "rad", "mm" -> "m", "0..255" -> "0..1"."""
 
-from __future__ import annotations
-
 import math
 
 from ...core.errors import DatasetError

@@ -1,7 +1,5 @@
 """Merges recordings into a LeRobot v3 folder, by a mapping file or a proposed mapping."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Actor-critic on imagined rollouts (DreamerV3, Hafner et al. 2023): lambda-returns, a two-hot critic, and a policy gradient by
 advantages or through the world."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Domain-adversarial training by gradient reversal (Ganin et al. 2016); keypoints by a spatial softmax (Levine et al. 2016).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Distillation: a world that draws a frame in many flow steps teaches one that draws it in one or two, without blur."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterator
 from collections.abc import Generator as Generating

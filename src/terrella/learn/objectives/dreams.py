@@ -7,8 +7,6 @@ alone would teach a mean of all that is possible; there a critic, and the distri
 targets.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

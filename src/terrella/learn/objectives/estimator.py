@@ -1,7 +1,5 @@
 """Estimator: depth from one picture, and from it motion between two, trained on recordings with depth and augmented pictures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Flow matching: a generator learns to draw recorded frames after its own predictions, with a critic of sharpness."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Hindsight goals: every state that an episode reached is a goal that its actions reached (HER, Andrychowicz et al. 2017; GCSL,
 Ghosh et al. 2019)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

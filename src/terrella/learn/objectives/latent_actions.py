@@ -5,8 +5,6 @@ expectation-maximisation, balanced at first so that every code is used), and the
 the two frames. Recorded actions are not used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

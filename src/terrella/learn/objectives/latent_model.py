@@ -4,8 +4,6 @@
 Codes are a few integers, so that they carry little more than the motion (Genie, Bruce et al. 2024).
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import nn

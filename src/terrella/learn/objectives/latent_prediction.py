@@ -4,8 +4,6 @@ The encoder makes its own targets, without a moving average or a stopped gradien
 projections of the latents that are not standard normal (LeJEPA, Balestriero & LeCun 2025; LeWorldModel, Maes et al. 2026).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Proximal policy optimisation (Schulman et al. 2017): several epochs over the rollouts of a policy in a fast simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import torch

@@ -1,7 +1,5 @@
 """Regression by an ensemble, each member on rows of its own draw (bagging, Breiman 1996)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import torch

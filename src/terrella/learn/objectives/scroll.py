@@ -1,7 +1,5 @@
 """Scroll: the displacement of most of the picture in a step, predicted from earlier ones, frames and actions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import NamedTuple
 

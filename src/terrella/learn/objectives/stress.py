@@ -1,7 +1,5 @@
 """Stress: training weighs pixels that change more than others; how much of that bias is corrected when frames are drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """train goals: a goal-conditioned policy in the latents of a world, from the recording of the world; see objectives/goals.py."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

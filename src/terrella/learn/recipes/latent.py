@@ -1,7 +1,5 @@
 """train latent: a recording into a latent world; see worlds/latent.py and objectives/latent_prediction.py."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

@@ -1,7 +1,5 @@
 """train latent-actions: a few actions learned from pictures alone; see objectives/latent_actions.py."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -4,8 +4,6 @@ With an estimator a world can start from a single picture, and with an uncertain
 with both. Its objects may be trained on another recording.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

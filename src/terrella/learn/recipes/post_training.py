@@ -1,7 +1,5 @@
 """train distil and train dreams: further training of a finished world, by a teacher or on its own rollouts."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass

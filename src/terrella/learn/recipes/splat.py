@@ -1,7 +1,5 @@
 """space fit: a recording with poses, or pictures, into a world of Gaussians; see space/fitting.py and worlds/splat.py."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping

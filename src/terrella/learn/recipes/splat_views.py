@@ -1,7 +1,5 @@
 """Inputs of `space fit`: a recording or pictures, with or without poses and depth, as posed views with depth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """train video: a recording into a playable world. What is learned depends on the recording: video_posed.py, video_flat.py."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

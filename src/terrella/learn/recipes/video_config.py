@@ -1,7 +1,5 @@
 """Settings of `train video`, and the kind of world that a recording allows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ...core.errors import DatasetError

@@ -1,7 +1,5 @@
 """Worlds of frames alone: recordings without depth or poses. Stages: scroll, outcome, then a codec, or a flow as a teacher."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

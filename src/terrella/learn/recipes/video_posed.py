@@ -1,7 +1,5 @@
 """Worlds of places: recordings with depth and poses. Stages: motion, outcome, objects, estimator, then a U-Net over a Glimpse."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Scenes of Gaussians as files of other tools: PLY, SuperSplat's compressed PLY, SPZ, SOG, GLB (written by glb.py)."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from pathlib import Path

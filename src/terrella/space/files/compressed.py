@@ -1,7 +1,5 @@
 """SuperSplat's compressed PLY: 16 bytes a Gaussian, in blocks of 256 with the limits of each; harmonics a byte a number."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

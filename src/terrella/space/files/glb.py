@@ -3,8 +3,6 @@
 glTF is right-handed, in metres, y up, and looks along -z: our x forward, y left, z up becomes (-y, z, -x), the axes "rub".
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from typing import Any

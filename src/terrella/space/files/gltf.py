@@ -1,7 +1,5 @@
 """glTF 2.0 as other tools write it (.glb, .gltf): its JSON, tables of numbers and pictures; broken and hostile ones refused."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 import io

@@ -1,7 +1,5 @@
 """The scene of a glTF file: triangles where they stand in the world, with colours, pictures and names; lights; or Gaussians."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

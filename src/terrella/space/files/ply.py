@@ -1,7 +1,5 @@
 """PLY: its header and its tables, hostile ones refused; and Gaussians as 3D Gaussian Splatting's code and gsplat write them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

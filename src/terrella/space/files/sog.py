@@ -1,7 +1,5 @@
 """SOG of version 2 (PlayCanvas): a meta.json and WebP pictures with a Gaussian a pixel, zipped or in a folder."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

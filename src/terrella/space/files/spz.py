@@ -1,8 +1,6 @@
 """SPZ, versions 1 to 4 (github.com/nianticlabs/spz): fixed-point places and a byte for nearly every other number, in gzip, or as
 streams of zstd (4)."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import struct

@@ -1,7 +1,5 @@
 """Carried: what the last frames show of another view (reproject.py)."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Real spherical harmonics of degree 0 to 3 and their slopes, with the signs and order of 3D Gaussian Splatting's files."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

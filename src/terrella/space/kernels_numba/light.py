@@ -1,7 +1,5 @@
 """Light among upright boxes: what rays meet, and what shines on what (layout/bake.py)."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Kernels of matching.py and mosaic.py: pixels that a displacement explains, the scroll of a picture, and the mosaic."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Paint: billboards into frames (billboards.py)."""
 
-from __future__ import annotations
-
 import math
 
 import numba

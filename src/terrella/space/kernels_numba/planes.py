@@ -1,7 +1,5 @@
 """Planes: values between pixels, and holes filled from coarser averages (reproject.py)."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

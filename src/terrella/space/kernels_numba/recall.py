@@ -1,7 +1,5 @@
 """Recall: which keyframes know a view, and what they show in it (keyframes.py)."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -5,8 +5,6 @@ largest exponent that is still drawn, red, green, blue, depth, half extents alon
 EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023). Camera x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

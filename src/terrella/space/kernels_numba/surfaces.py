@@ -1,7 +1,5 @@
 """Surfaces: depth images lifted to patches, and patches cast into views (patches.py)."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -1,8 +1,6 @@
 """Tiles: splats (splats.py) sorted by depth and shared out over tiles of 16 by 16 pixels; a tile is painted row by row, so that one
 row is one vector of a processor."""
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -1,7 +1,5 @@
 """Walls: straight runs of columns, and a body that slides along what they draw (floorplan.py)."""
 
-from __future__ import annotations
-
 import math
 
 import numba

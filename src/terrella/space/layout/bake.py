@@ -3,8 +3,6 @@
 A light map of texels gathers the light of lamps, windows and the sun, and of three bounces between texels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

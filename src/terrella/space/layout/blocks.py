@@ -1,7 +1,5 @@
 """A layout as axis-aligned boxes with looks: walls, frames, steps, table legs, and the air between them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

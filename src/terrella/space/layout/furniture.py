@@ -1,7 +1,5 @@
 """Furniture made of boxes: the usual size, look and parts of each kind, where it stands, and whether it stops walkers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 # Corners in shares of width, depth and height; a look, "" for that of the whole.

@@ -1,7 +1,5 @@
 """Looks: "dark red planks" as a material, a colour and a procedural texture."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

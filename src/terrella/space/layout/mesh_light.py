@@ -1,7 +1,5 @@
 """Light on a scene of triangles from lamps, the sun and emissive surfaces, with shadow maps (Williams 1978)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The collider of a scene of triangles as axis-aligned boxes: the scene's own boxes, and small ones around all other triangles."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

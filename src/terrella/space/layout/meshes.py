@@ -1,7 +1,5 @@
 """A scene of triangles as a place to walk in: flat lit Gaussians on pieces of triangles, and boxes that stop walkers."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

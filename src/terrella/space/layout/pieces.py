@@ -1,7 +1,5 @@
 """Triangles cut into small pieces."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """Places things in a room that was described in words: at walls, in corners, around tables; at random where words leave it open."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator, Sequence

@@ -3,8 +3,6 @@
 World frame, metres: x east, y north, z up. Walls are 0.1 m thick and lie outside a room's own space.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

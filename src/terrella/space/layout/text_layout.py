@@ -6,8 +6,6 @@
 Rooms follow one another to the east, joined by doors. Unknown words are reported.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from typing import Any

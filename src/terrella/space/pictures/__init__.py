@@ -1,7 +1,5 @@
 """Pictures of a place, posed or plain, or a video, as posed views of one camera; learn/recipes/splat.py fits them."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """COLMAP through pycolmap: reads its models, and finds poses and points of plain pictures (x right, y down, z forward)."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

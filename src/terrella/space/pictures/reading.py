@@ -1,7 +1,5 @@
 """Reads pictures that people have: of any mode, turned as EXIF says, 8 or 16 bits; what is none is refused in a sentence."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """transforms.json: posed pictures as nerfstudio, instant-ngp and NeRF's Blender sets write them (x right, y up, z back; z up)."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Gaussians moved, turned and scaled as a whole, their harmonics with them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

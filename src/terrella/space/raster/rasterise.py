@@ -4,8 +4,6 @@ Splats are projected, sorted by depth once for the whole picture, shared out ove
 tile is opaque. slow.py is the same in plain tensor algebra.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The slow, obvious twin of rasterise.py, for tests: every Gaussian at every pixel, in plain tensor algebra."""
 
-from __future__ import annotations
-
 import math
 
 import torch
