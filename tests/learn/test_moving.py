@@ -20,6 +20,7 @@ from terrella.learn import moving_batches
 from terrella.learn.moving_batches import mirrored, mirrored_buttons, moving_batch
 from terrella.learn.recipes.parts import ObjectsTraining, train_objects
 from terrella.learn.recipes.video import train_video
+from terrella.learn.recipes.video_config import video_config
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
 from terrella.learn.trainer import TrainStep
 from terrella.worlds.body import follow_stairs
@@ -50,14 +51,7 @@ def rows(haunted):
     return Recording(cache, start, np.ones(cache.length, bool))
 
 
-@pytest.fixture(scope="module")
-def still_run(haunted, tmp_path_factory):
-    """The same recording, learned as if nothing moved in it."""
-    out = tmp_path_factory.mktemp("still")
-    return out, train_video(haunted, out, replace(BARE, moving=False), quiet)
-
-
-def test_a_world_learned_of_moving_things_keeps_the_contract(haunted_run, still_run):
+def test_a_world_learned_of_moving_things_keeps_the_contract(haunted, haunted_run):
     for memory in (True, False):
         world = load_world(haunted_run[0] / "world", memory=memory)
         assert (world.starts.depth == 0).any(), "what moves is in no keyframe"
@@ -65,7 +59,8 @@ def test_a_world_learned_of_moving_things_keeps_the_contract(haunted_run, still_
         assert "observes" in check_world(world) and world.spec.may_observe == ("things", "health")
     state = world.start(2, make_rng(0))
     assert world.render(state, ("health",))["health"].tolist() == [100.0, 100.0]
-    assert not load_world(still_run[1]["world"]).config.moving
+    recording = Recording.open(haunted, BARE.size, quiet)
+    assert [video_config(recording, replace(BARE, moving=moving)).moving for moving in (True, False)] == [True, False]
 
 
 def test_a_world_whose_things_are_cards_keeps_the_contract(peopled, tmp_path):
@@ -99,14 +94,12 @@ def test_a_world_takes_another_cast_and_keeps_the_rest(peopled, tmp_path):
     assert torch.equal(new.objects.begun[..., NUMBER], world.objects.begun[..., NUMBER])
 
 
-def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(
-    peopled, haunted, still_run, tmp_path
-):
+def test_a_world_without_things_and_a_recording_that_tells_none_apart_are_refused(peopled, haunted, bare_run, tmp_path):
     _, folder = peopled
     with pytest.raises(DatasetError, match="holds no observation.objects"):
         train_objects(folder / "run" / "world", haunted, tmp_path / "x", ObjectsTraining(5), quiet)
     with pytest.raises(TrainingError, match="knows no things"):
-        train_objects(still_run[1]["world"], folder / "set", tmp_path / "x", ObjectsTraining(5), quiet)
+        train_objects(bare_run[0] / "world", folder / "set", tmp_path / "x", ObjectsTraining(5), quiet)
 
 
 def test_evidence_of_cards_is_taken_and_bad_evidence_refused(peopled):
