@@ -152,8 +152,7 @@ def _errors(inputs: list[np.ndarray], targets: list[np.ndarray], folds: list[np.
 
 def _tamed(motion: np.ndarray, parts: list[EpisodeMotion]) -> np.ndarray:
     """Clips jumps (a reset, an angle that wraps), which would dominate the regression."""
-    every = np.concatenate([part.motion for part in parts])
-    low, high = np.percentile(every, [1, 99], axis=0)
+    low, high = np.percentile(np.concatenate([part.motion for part in parts]), [1, 99], axis=0)
     return motion.clip(low - (high - low), high + (high - low))
 
 

@@ -188,8 +188,7 @@ def _duplicates(folder: Survey, rows: RowFacts, shown: FilmFacts) -> Iterator[Fa
             seen.file, seen.first, f"episode {later} has the same actions and states as episode {first}", _TWINS
         )
     pictures = {number: digest.hexdigest() for number, digest in shown.digests.items() if number not in shown.static}
-    stored = any(feature["dtype"] == "image" for feature in folder.features.values())
-    if stored:
+    if any(feature["dtype"] == "image" for feature in folder.features.values()):
         pictures = {number: seen.pictures.hexdigest() for number, seen in rows.episodes.items() if seen.changes}
     for first, later in equal_digests(pictures):
         if later not in known:

@@ -17,10 +17,8 @@ from .survey import LEFTOVER, RESTORE, Fault, Survey
 _SHORTEN = "use --repair, which keeps the rows that the video shows"
 _EXCHANGE = "swap the two videos, as --repair does"
 _SAMPLES, _OF_STRANGERS = 64, 24  # most pictures of an episode that are decoded
-_LIKE, _UNLIKE = (
-    0.01,
-    0.06,
-)  # differences from the statistics, as a share of full brightness: below is equal, above is different
+# differences from the statistics, as a share of full brightness: below is equal, above is different
+_LIKE, _UNLIKE = 0.01, 0.06
 _BETTER = 3.0  # another episode's statistics must be this many times closer
 _USUAL, _FEW = 6.0, 4  # multiple of the median difference that is no chance; episodes from which a median is taken
 
@@ -125,8 +123,7 @@ def _decoded(
 def _sampled(survey: Survey, count: int) -> list[int]:
     """Rows whose pictures are decoded: the rows of our recorder's statistics, else a sample; always the first and the last."""
     if survey.ours:
-        step = SAMPLE_EVERY * -(-count // (SAMPLE_EVERY * _SAMPLES))
-        return sorted({*range(0, count, step), count - 1})
+        return sorted({*range(0, count, SAMPLE_EVERY * -(-count // (SAMPLE_EVERY * _SAMPLES))), count - 1})
     return sorted({round(row) for row in np.linspace(0, count - 1, _OF_STRANGERS)})
 
 

@@ -84,10 +84,8 @@ Chunk = list[Page]
 
 
 def rebuild_footer(path: Path, form: pa.Schema, features: Mapping[str, dict], target: Path) -> int:
-    """Writes the row groups of `path` that are whole, of schema `form`, with a new footer to `target`; returns their rows.
-
-    DatasetError where not one row group is whole.
-    """
+    """Writes the whole row groups of `path`, of schema `form`, with a new footer to `target`; returns their rows. DatasetError
+    where no row group is whole."""
     leaves, footer = _template(form)
     each = [_values_of_a_row(name, features) for name, _ in leaves]
     with open(path, "rb") as file:
@@ -107,8 +105,7 @@ def _template(form: pa.Schema) -> tuple[list[tuple[str, str]], thrift.Struct]:
     buffer = io.BytesIO()
     pq.write_table(form.empty_table(), buffer)
     raw = buffer.getvalue()
-    size = int.from_bytes(raw[-8:-4], "little")
-    footer, _ = thrift.read_struct(raw[-8 - size : -8])
+    footer, _ = thrift.read_struct(raw[-8 - int.from_bytes(raw[-8:-4], "little") : -8])
     columns = pq.ParquetFile(io.BytesIO(raw)).schema
     return [(columns.column(i).path, columns.column(i).physical_type) for i in range(len(columns.names))], footer
 

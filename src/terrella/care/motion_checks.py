@@ -143,8 +143,7 @@ def _small(picture: np.ndarray) -> np.ndarray:
     """float64 [h, w], each side at most _EDGE pixels: block averages of the grey picture."""
     block = max(1, -(-max(picture.shape[:2]) // _EDGE))
     height, width = picture.shape[0] // block, picture.shape[1] // block
-    cut = picture[: height * block, : width * block].mean(2)
-    return cut.reshape(height, block, width, block).mean((1, 3))
+    return picture[: height * block, : width * block].mean(2).reshape(height, block, width, block).mean((1, 3))
 
 
 def _shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:

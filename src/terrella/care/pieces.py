@@ -25,10 +25,8 @@ _A_BYTE = 4  # unpacked bytes of texts and pictures allowed for each byte of a l
 def read_batches(
     path: Path, features: Mapping[str, dict], columns: Sequence[str]
 ) -> Iterator[tuple[int, int, pa.Table | DatasetError]]:
-    """(first row, rows, table) of a data file, batch by batch of some megabytes; DatasetError where the file is broken.
-
-    A batch that cannot be read is given as the error itself, and reading goes on with the next row group.
-    """
+    """(first row, rows, table) of a data file, some megabytes at a time; DatasetError where the file is broken. A batch that cannot
+    be read is given as the error itself, and reading goes on with the next row group."""
     texts = any(features[name]["dtype"] in ("image", "string") for name in columns)
     wide = 8 + sum(16 * math.prod(features[name]["shape"]) for name in columns if features[name]["dtype"] != "image")
     try:
@@ -177,8 +175,7 @@ def _frames(survey: Survey, table: Table, rows: np.ndarray, start: int | None) -
     frame, index = table.columns["frame_index"][rows], table.columns["index"][rows]
     time = np.round(table.columns["timestamp"][rows] * survey.fps)
     if start is None:
-        offset = (index - frame)[np.isfinite(index - frame)]
-        values, counts = np.unique(offset, return_counts=True)
+        values, counts = np.unique((index - frame)[np.isfinite(index - frame)], return_counts=True)
         start = int(values[counts.argmax()]) if len(values) else 0
     votes = np.stack([frame, index - start, time])
     votes = np.where(np.isfinite(votes) & (np.abs(votes) < 2**53), votes, -1).astype(np.int64)

@@ -220,13 +220,11 @@ def _summarise(facts: RowFacts, columns: Mapping[str, np.ndarray]) -> None:
         }
         facts.summary = stats.merge([facts.summary, part])
         if ACTION in part:
-            valid = (
-                columns[ACTION_VALID].reshape(-1).astype(bool)
-                if ACTION_VALID in columns
-                else np.ones(len(columns[ACTION]), bool)
-            )
-            if valid.any():
-                facts.acted = stats.merge([facts.acted, {ACTION: stats.summarise(columns[ACTION][valid])}])
+            acted = columns[ACTION]
+            if ACTION_VALID in columns:
+                acted = acted[columns[ACTION_VALID].reshape(-1).astype(bool)]
+            if len(acted):
+                facts.acted = stats.merge([facts.acted, {ACTION: stats.summarise(acted)}])
 
 
 def _alike(stored: pa.DataType, promised: pa.DataType) -> bool:
@@ -263,9 +261,8 @@ def _lengths(survey: Survey, facts: RowFacts) -> Iterator[Fault]:
             what = f"it holds {seen.rows} rows of episode {number}, which meta/episodes does not list"
             yield Fault(seen.file, seen.first, what, FROM_ROWS)
         done = np.concatenate(seen.done) if seen.done else np.zeros(0, bool)
-        for at in np.flatnonzero(done[:-2])[
-            :1
-        ]:  # the last two rows may be done: the last step and the terminal observation
+        # the last two rows may be done: the last step and the terminal observation
+        for at in np.flatnonzero(done[:-2])[:1]:
             what = f"done is set {len(done) - 1 - int(at)} rows before the end of episode {number}"
             mend = "split the episode there, or clear the flag"
             yield Fault(seen.file, (seen.first or 0) + int(at), what, mend)

@@ -139,8 +139,7 @@ class StreamMender:
         bad = np.flatnonzero(~(good[wanted.clip(max=opened.count)] & follows_on))
         usable = wanted[: bad[0]] if len(bad) else wanted
         if len(usable):
-            target = self.staging / f"stream-{name}.mp4"
-            cut_video(path, int(usable[0]), len(usable), rate, target, opened)
+            cut_video(path, int(usable[0]), len(usable), rate, self.staging / f"stream-{name}.mp4", opened)
         return usable
 
 
@@ -176,5 +175,4 @@ def _readings(path: Path, sensor: Sensor) -> tuple[np.ndarray, list[np.ndarray]]
 def _in_order(time_s: np.ndarray) -> np.ndarray:
     """bool [n]: the readings that are at a finite time, none of them before one that came earlier."""
     finite = np.isfinite(time_s)
-    newest = np.maximum.accumulate(np.where(finite, time_s, -np.inf))
-    return finite & (time_s >= newest)
+    return finite & (time_s >= np.maximum.accumulate(np.where(finite, time_s, -np.inf)))

@@ -1,7 +1,5 @@
-"""Thrift's compact protocol, as much of it as parquet's page headers and footers need.
-
-A struct is a dict: field number -> (type, value). A list is (type of its items, items).
-"""
+"""Thrift's compact protocol, as far as parquet's headers and footers need it. A struct is {field number: (type, value)}, a list
+(type of its items, items)."""
 
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 _DEEPEST, _LONGEST = 32, 1_000_000  # nesting, items of a list; more is damage

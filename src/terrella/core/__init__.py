@@ -1,7 +1,5 @@
-"""The contract that every room shares: World, Spec, State, Policy, rollout, as_env, check_world, errors.
-
-Each name is imported when it is first used, because `core.spec` and `core.errors` need no torch.
-"""
+"""The contract that every room shares: World, Spec, State, Policy, rollout, as_env, check_world, errors. Each name is imported
+when it is first used, because `core.spec` and `core.errors` need no torch."""
 
 from __future__ import annotations
 

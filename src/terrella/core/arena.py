@@ -115,8 +115,7 @@ class Arena:
 
     def _sweep(self, count: int) -> None:
         """Frees the rows that no pointer holds; grows the arena where fewer than `count`, or few, are free."""
-        marks = self.used().cpu()
-        free = (~marks).nonzero()[:, 0]
+        free = (~self.used().cpu()).nonzero()[:, 0]
         before = self.capacity
         if len(free) < max(count, before // 4):  # with few free rows it would sweep again soon
             more = max(before, count)
@@ -129,9 +128,7 @@ class Arena:
 
     def _blank(self, name: str, rows: int) -> torch.Tensor:
         dtype, shape = self.parts[name]
-        blank = torch.empty(
-            (rows, *shape), dtype=dtype, device=self.device
-        )  # the system gives memory on the first write
+        blank = torch.empty((rows, *shape), dtype=dtype, device=self.device)  # memory is given on the first write
         blank[:1] = 0
         return blank
 

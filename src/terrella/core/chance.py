@@ -1,7 +1,7 @@
-"""Counter-based random numbers: one seed for each batch entry gives the same noise on any device and in any batch.
+"""Counter-based random numbers: one seed for each batch entry gives the same noise on any device and in any batch, at any time.
 
 The noise of an entry is a hash of (seed, stream, position): splitmix64 (Steele, Lea & Flood 2014), used as a counter-based
-generator (Salmon et al. 2011). So a batch of B equals B singles, and a frame can be rendered long after its step.
+generator (Salmon et al. 2011).
 """
 
 import math

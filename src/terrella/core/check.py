@@ -254,8 +254,7 @@ def _states_can_be_saved(world: World, seed: int, steps: int) -> None:
         action = world.spec.sample_action(1, rng)
         expected = _copy(world.render(world.imagine(state, action, make_rng(seed + 1)), channels))
         world.start(1, make_rng(seed + 2))  # a world that keeps data outside of the State has lost it now
-        device = next(iter(state.values())).device
-        restored = State.load(Path(folder) / "state.safetensors").to(device)
+        restored = State.load(Path(folder) / "state.safetensors").to(next(iter(state.values())).device)
     _require(_same(before, world.render(restored, channels)), "a saved and restored state must render the same.")
     after = world.imagine(restored, action, make_rng(seed + 1))
     _require(_same(expected, world.render(after, channels)), "a restored state must go on as the original.")
@@ -294,8 +293,7 @@ def _a_batch_equals_its_singles(world: World, seed: int, steps: int) -> None:
     together = _copy(world.render(world.imagine(states, actions, make_rng(seed + 1)), channels))
     one_rng = make_rng(seed + 1)
     for entry in range(2):
-        after = world.imagine(states.at(entry), actions[entry : entry + 1], one_rng)
-        alone = world.render(after, channels)
+        alone = world.render(world.imagine(states.at(entry), actions[entry : entry + 1], one_rng), channels)
         for name in channels:
             message = f"channel '{name}' of a batch differs from that of single episodes stepped one after the other."
             _require(_close(alone[name], together[name][entry : entry + 1]), message)

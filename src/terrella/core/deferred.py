@@ -164,10 +164,8 @@ class Ready:
 
 
 class Deferred:
-    """The tensors `names` of a state and the plan that computes them: Deferred(("rgb",), Step(draw, before, now)).
-
-    They are computed under the gradient mode in which this object was made; then the plan is released. Thread-safe.
-    """
+    """The tensors `names` of a state and the plan that computes them: Deferred(("rgb",), Step(draw, before, now)), once, under the
+    gradient mode in which this object was made; then the plan is released. Thread-safe."""
 
     def __init__(self, names: Iterable[str], plan: Step | Pick | Ready):
         self.names, self.batch, self.device = tuple(names), plan.batch, plan.device

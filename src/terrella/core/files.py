@@ -1,7 +1,5 @@
-"""Files that are replaced whole: after a power cut or kill -9 there is the old file or the new one, never half of one.
-
-A new file is written under a hidden name beside its target, synced to the disk, and renamed over the target.
-"""
+"""Files that are replaced whole: each is written under a hidden name beside its target, synced to the disk, and renamed. After a
+power cut or kill -9 there is the old file or the new one, never half of one."""
 
 import errno
 import json
@@ -85,10 +83,8 @@ def write_json(target: str | Path, value: object, indent: int = 2) -> None:
 
 @contextmanager
 def creating(path: str | Path) -> Iterator[Path]:
-    """Gives a hidden path for a new file or folder; without an exception it is then renamed to `path`.
-
-    Nothing half-written stays. DatasetError where `path` exists (an empty folder may), or the disk is full or fails.
-    """
+    """Gives a hidden path for a new file or folder, renamed to `path` if there is no exception; nothing half-written stays.
+    DatasetError where `path` exists (an empty folder may), or the disk is full or fails."""
     path = Path(path)
     try:
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):

@@ -46,8 +46,7 @@ _SPARE = (*(f"Digit{digit}" for digit in "1234567890"), *(f"Key{letter}" for let
 def code_of(key: str | int) -> str:
     """The browser's code (KeyboardEvent.code) of a key: a name ("a", "left", "space"), an `ord` or pygame number, or a code."""
     if isinstance(key, int | np.integer):
-        known = _PYGAME.get(int(key)) or (chr(key) if 0 <= key < 256 else "")
-        key = known
+        key = _PYGAME.get(int(key)) or (chr(key) if 0 <= key < 256 else "")
     if key.lower() in _CODES:
         return _CODES[key.lower()]
     if len(key) == 1 and key.isascii() and key.isalnum():
@@ -94,8 +93,7 @@ def keys_of(names: Sequence[str]) -> dict[str, int]:
 
 def _one_axis(taken: Mapping[str, int]) -> bool:
     """Whether a game moves along one axis only, so that both pairs of arrows can serve it."""
-    ways = {taken[code] for code in taken if code.startswith("Arrow")}
-    return len(ways) <= 2
+    return len({taken[code] for code in taken if code.startswith("Arrow")}) <= 2
 
 
 def _parts(name: str) -> tuple[list[str], set[str]]:
@@ -218,10 +216,7 @@ def all_names(spec: Spec) -> list[str]:
 
 
 def with_action_names(spec: Spec, names: Mapping[int, str]) -> Spec:
-    """The spec with new names for the actions at these indices; its idle action stays the same.
-
-    TerrellaError where two actions would have one name.
-    """
+    """The spec with new names for the actions at these indices, the same idle action; TerrellaError for a name given twice."""
     if not names:
         return spec
     whole = [names.get(at, name) for at, name in enumerate(all_names(spec))]

@@ -1,7 +1,4 @@
-"""Spec: the declaration of a world: its actions, cameras, channels, time step and units.
-
-Importing this needs no torch, so tools that only convert and repair recordings run without it.
-"""
+"""Spec: the declaration of a world. Importing this needs no torch, so tools that convert and repair recordings run without it."""
 
 from __future__ import annotations
 
@@ -84,9 +81,7 @@ class Spec:
     kind and a suffix: "rgb" and "rgb.wrist", "depth.wrist", "pose.wrist"."""
     observes: tuple[str, ...]  # channels that `observe` requires
     dt_s: float  # seconds of world time that one `imagine` advances
-    units: Mapping[str, str] = field(
-        default_factory=dict
-    )  # channel -> unit ("m", "reward"), for channels that have one
+    units: Mapping[str, str] = field(default_factory=dict)  # channel -> unit ("m", "reward"), where it has one
     action_names: tuple[str, ...] = ()
     """One name for each button (MultiBinary), choice (Discrete, or one of a MultiDiscrete) or axis (Box); () for none."""
     action_units: tuple[str, ...] = ()  # one unit for each axis ("m", "rad/s", "N m"); () for none
@@ -131,10 +126,8 @@ class Spec:
                 raise ChannelError(f"{self.name} cannot render '{name}'; it has {', '.join(self.channels)}.")
 
     def check_action(self, action: torch.Tensor, batch: int) -> torch.Tensor:
-        """The action as a tensor [batch, *action.shape] of the dtype of the space, with its gradient.
-
-        ActionError where the shape, the type or a value does not fit the space.
-        """
+        """The action as a tensor [batch, *action.shape] of the dtype of the space, with its gradient; ActionError where its shape,
+        type or a value does not fit the space."""
         import torch
 
         low, high = self.action_limits
@@ -199,11 +192,8 @@ def can_idle(spec: Spec) -> bool:
 
 
 def neutral_action(spec: Spec) -> np.ndarray:
-    """The action [*action.shape] that does least.
-
-    It is `spec.idle` where that is given; else no button; the choice whose name means doing nothing, or the first; axes at
-    0, or at the limit nearest to 0.
-    """
+    """The action [*action.shape] that does least: `spec.idle` where it is given; else no button; the choice whose name means doing
+    nothing, or the first; axes at 0, or at the limit nearest to 0."""
     low, high = spec.action_limits
     if spec.idle:
         return np.asarray(spec.idle, dtype_of(spec.action)).reshape(shape_of(spec.action))

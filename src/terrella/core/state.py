@@ -169,9 +169,7 @@ class State(Mapping):
 
     def into(self, arenas: Arena | Mapping[str, Arena]) -> State:
         """The same state with its rows in the given arenas (one for all pointers, or by pointer); copies rows of other arenas.
-
-        ContractError where an arena has another layout.
-        """
+        ContractError where an arena has another layout."""
         changed = {}
         for name, mine in self._arenas.items():
             arena = arenas if isinstance(arenas, Arena) else arenas.get(name, mine)

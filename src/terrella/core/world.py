@@ -65,10 +65,8 @@ class Leaping(World, Protocol):
     """A World that can predict `spec.leap` steps at once; its `spec.leap` is above 0."""
 
     def leap(self, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:
-        """The state `spec.leap` steps later, under actions [B, leap, *action.shape].
-
-        Only the channel `latent` of the result is defined: the rewards of the steps in between are not predicted.
-        """
+        """The state `spec.leap` steps later, under actions [B, leap, *action.shape]: its channel `latent` alone is defined, for the
+        rewards of the steps in between are not predicted."""
         ...
 
 

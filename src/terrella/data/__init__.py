@@ -1,7 +1,5 @@
-"""Recordings: LeRobot v3.0 reader and crash-safe writer, the recorder, clips for training.
-
-Nothing here needs torch but `record` and its options, which are imported when they are first used.
-"""
+"""Recordings: LeRobot v3.0 reader and crash-safe writer, the recorder, clips for training. Only `record` and its options need
+torch; they are imported when they are first used."""
 
 from __future__ import annotations
 

@@ -28,10 +28,8 @@ _IMAGES = "observation.images."
 
 
 def feature_of(channel: str) -> str:
-    """The feature that holds a channel: rgb.wrist -> observation.images.wrist, depth.wrist -> observation.depth.wrist.
-
-    The main camera's are observation.images.rgb, observation.depth and observation.state (its pose).
-    """
+    """The feature that holds a channel: rgb.wrist -> observation.images.wrist, depth.wrist -> observation.depth.wrist; of the main
+    camera observation.images.rgb, observation.depth and observation.state (its pose)."""
     kind, _, suffix = channel.partition(".")
     if channel in _MAIN:
         return _MAIN[channel]
@@ -58,10 +56,8 @@ def current_feature(feature: str) -> str:
 
 
 def features_of(channels: Iterable[str]) -> dict[str, str]:
-    """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose.
-
-    DatasetError where two channels would share a feature, or a name is not a valid feature name.
-    """
+    """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose. DatasetError where
+    two channels would share a feature, or a name is not a valid feature name."""
     features: dict[str, str] = {}
     channels = list(channels)
     for channel in channels:

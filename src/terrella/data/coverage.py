@@ -109,11 +109,8 @@ def _groups(dataset: Dataset, taken: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _movements(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Features [T - 1, F] of the change between small pictures [T, n, n, 3]: (local, global).
-
-    Local: the change of brightness of each block, and its size. Global: optical flow (sums of Lucas and Kanade's method),
-    first moments of the change, and its total size.
-    """
+    """Features [T - 1, F] of the change between small pictures [T, n, n, 3]: (local: the change of brightness of each block, and
+    its size; global: sums of Lucas and Kanade's optical flow, first moments of the change, and its total size)."""
     apart, grey = pictures[1:] - pictures[:-1], pictures[:-1].mean(3)
     steps, side = len(apart), pictures.shape[1]
     coarse = apart.reshape(steps, side // 2, 2, side // 2, 2, 3).mean((2, 4)).reshape(steps, -1)
@@ -126,11 +123,8 @@ def _movements(pictures: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shown(movements: Sequence[np.ndarray], groups: dict[str, np.ndarray]) -> tuple[dict[str, bool], tuple[str, ...]]:
-    """(action -> whether it has an effect, actions that are too rare).
-
-    An action has an effect if the mean change after it is further from the overall mean than for any random time shift of
-    the same actions. A shift keeps the time for which actions are held.
-    """
+    """(action -> whether it has an effect, actions that are too rare): an effect is a mean change further from the overall mean
+    than for any random time shift of the same actions. A shift keeps the time for which actions are held."""
     kinds = [part - part.mean(0) for part in movements]
     kinds = [(part / (part.std(0) + 1e-2)).astype(np.float32) for part in kinds]
     shown, rare, count = {}, [], len(kinds[0])

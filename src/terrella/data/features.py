@@ -42,10 +42,8 @@ def checked_features(features: object) -> dict[str, dict]:
 
 
 def sensors_of(features: Mapping[str, dict], known: Mapping[str, Sensor]) -> dict[str, Sensor]:
-    """The Sensors of `features`, with the facts in `known` (the sensors of meta/terrella.json) added.
-
-    A feature is depth if it states so, or if its name does and it holds uint16 numbers or pictures of one channel.
-    """
+    """The Sensors of `features`, with the facts in `known` (the sensors of meta/terrella.json) added. A feature is depth if it
+    states so, or if its name does and it holds uint16 numbers or pictures of one channel."""
     sensors = {}
     for name, feature in features.items():
         if name in AUTOMATIC or name in (ACTION_VALID, TIME):

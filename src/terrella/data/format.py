@@ -191,10 +191,8 @@ def checked_name(path: str) -> str:
 
 
 def path_inside(root: Path, name: str) -> Path:
-    """Where a file of a dataset lies, there or not; DatasetError where its name or a symbolic link leads out of `root`.
-
-    Of a Hugging Face cache (snapshots/REVISION/… -> ../../blobs/…) a link may lead to that cache's own blobs.
-    """
+    """Where a file of a dataset lies, there or not; DatasetError where its name or a symbolic link leads out of `root`. In a
+    Hugging Face cache (snapshots/REVISION/… -> ../../blobs/…) a link may lead to that cache's own blobs."""
     path, home = root / checked_name(name), os.path.realpath(root)
     real = os.path.realpath(path)
     parts = Path(home).parts
@@ -247,8 +245,7 @@ def to_arrow(array: np.ndarray, kind: pa.DataType) -> pa.Array:
         return pa.FixedSizeListArray.from_arrays(flat, kind.list_size)
     if pa.types.is_list(kind):
         for axis in range(array.ndim - 1, 0, -1):
-            lines = int(np.prod(array.shape[:axis]))
-            offsets = np.arange(lines + 1, dtype=np.int32) * array.shape[axis]
+            offsets = np.arange(int(np.prod(array.shape[:axis])) + 1, dtype=np.int32) * array.shape[axis]
             flat = pa.ListArray.from_arrays(offsets, flat)
     return flat
 

@@ -175,17 +175,14 @@ class EpisodeTable(Sequence[Episode]):
 def read_episodes(
     root: Path, files: LocalFiles | Files, info: Mapping, cameras: Sequence[str], count: int
 ) -> EpisodeTable:
-    """The first `count` episodes of meta/episodes; rows that a killed recorder left after them are ignored.
-
-    info: meta/info.json. cameras: the features that are stored as video.
-    """
+    """The first `count` episodes of meta/episodes; rows that a killed recorder left after them are ignored. info: meta/info.json;
+    cameras: the features that are stored as video."""
     if count > MOST:
         raise DatasetError(f"{root} claims {count:,} episodes, more than possible; restore meta/info.json from a copy.")
     parts = _read_parts(files, cameras, count)
     try:
         table = pa.concat_tables(parts, promote_options="default") if parts else _nothing(columns_of(cameras))
-        number = _whole(table, "episode_index")
-        _, first = np.unique(number, return_index=True)
+        _, first = np.unique(_whole(table, "episode_index"), return_index=True)
         table = table.take(pa.array(first[: min(count, len(first))])).combine_chunks()
         if len(table) != count or not np.array_equal(_whole(table, "episode_index"), np.arange(count)):
             raise ValueError(f"it does not list the {count} episodes of info.json")

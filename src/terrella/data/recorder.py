@@ -104,10 +104,8 @@ class Recorder:
         done: bool | None = None,
         time_s: float | None = None,
     ) -> None:
-        """Adds one row; the observation has no batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...).
-
-        `action` is None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`.
-        """
+        """Adds one row; the observation has no batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...). `action` is
+        None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`."""
         row = {self.layout.channels.get(name) or feature_of(name): value for name, value in observation.items()}
         unknown = sorted(name for name in row if name not in self.layout.sensors)
         if unknown:

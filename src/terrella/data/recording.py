@@ -55,9 +55,8 @@ def record(
     layout = replace(Layout.of(world.spec, options.fps), pictures=options.pictures)
     base = base_of(rng)
     task = options.task or f"explore {world.spec.name}"
-    with Recorder(
-        root, layout, task, "discard", options.live
-    ) as recorder:  # the seed gives an interrupted episode again
+    # an interrupted episode is discarded, for its seed gives it again
+    with Recorder(root, layout, task, "discard", options.live) as recorder:
 
         def stop() -> bool:
             if progress:

@@ -52,8 +52,7 @@ def picked_rows(time_s: np.ndarray, at_s: np.ndarray, policy: Policy, max_gap_s:
         before, after = np.maximum(after - 1, 0), np.minimum(after, len(time_s) - 1)
         index = np.where(np.abs(time_s[after] - at_s) < np.abs(at_s - time_s[before]), after, before)
         index = np.searchsorted(time_s, time_s[index], side="right") - 1
-    far = np.abs(at_s - time_s[np.maximum(index, 0)])
-    return np.where((index < 0) | (far > _limit(max_gap_s)), -1, index)
+    return np.where((index < 0) | (np.abs(at_s - time_s[np.maximum(index, 0)]) > _limit(max_gap_s)), -1, index)
 
 
 def resample(
@@ -190,10 +189,8 @@ def _mixed(time_s, values, sensor: Sensor, at_s, b) -> np.ndarray:
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Unit quaternions [n, 4] on the shorter arc from a (share 0) to b (share 1), in a's sign; share [n, 1].
-
-    Where a or b is zero, and so no rotation, the nearer of the two is returned unchanged. (Shoemake 1985)
-    """
+    """Unit quaternions [n, 4] on the shorter arc from a (share 0) to b (share 1), in a's sign; share [n, 1] (Shoemake 1985). Where
+    a or b is zero, and so no rotation, the nearer of the two is returned unchanged."""
     long_a, long_b = np.linalg.norm(a, axis=1, keepdims=True), np.linalg.norm(b, axis=1, keepdims=True)
     whole = (long_a > 0) & (long_b > 0)
     unit_a, unit_b = a / np.where(whole, long_a, 1), b / np.where(whole, long_b, 1)

@@ -49,9 +49,7 @@ class Readings:
     """The readings of a sensor: values[i] at time_s[i]."""
 
     time_s: np.ndarray  # float64 [n], ascending, seconds since the take began
-    values: (
-        Sequence[np.ndarray] | np.ndarray
-    )  # [n, ...], or a sequence of n arrays, which may be decoded each time they are read
+    values: Sequence[np.ndarray] | np.ndarray  # [n, ...], or n arrays, which may be decoded each time they are read
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ def summarise(values: np.ndarray, sampled: bool = False) -> Summary:
     if sampled:
         some = values[::4, ::4, ::4].astype(np.float64).reshape(-1, 1)
         return _summary(some, len(values), (1,) * (values.ndim - 1))
-    shape = values.shape[1:] or (1,)
-    return _summary(values.astype(np.float64).reshape(len(values), -1), len(values), shape)
+    return _summary(values.astype(np.float64).reshape(len(values), -1), len(values), values.shape[1:] or (1,))
 
 
 def summarise_pictures(pictures: np.ndarray) -> Summary:

@@ -128,10 +128,8 @@ class Writer:
         return number
 
     def tidy(self, first: int | None = None) -> None:
-        """Merges one-row tables of meta/episodes, EPISODES_PER_TABLE at a time; a failure leaves them as they are.
-
-        Looks at the newest episodes, or at all from number `first` on.
-        """
+        """Merges one-row tables of meta/episodes, EPISODES_PER_TABLE at a time, from episode `first` on (None: the newest); a
+        failure leaves them as they are."""
         newest = max(0, self.episodes // EPISODES_PER_TABLE - 1) * EPISODES_PER_TABLE
         with suppress(OSError, pa.ArrowException, ValueError, KeyError):  # many small tables are valid, too
             oldest = newest if first is None else first
@@ -197,8 +195,7 @@ class Writer:
         self.rows, self.episodes = info["total_frames"], info["total_episodes"]
         if self.episodes:
             self._tasks = pq.read_table(self.root / TASKS).column("__index_level_0__").to_pylist()
-            stored = json.loads((self.root / STATS).read_text(encoding="utf-8"))
-            self._stats = stats.from_json(stored)
+            self._stats = stats.from_json(json.loads((self.root / STATS).read_text(encoding="utf-8")))
             if any(int(summary["count"][0]) != self.rows for summary in self._stats.values()):
                 self._stats = self._stats_of_episodes()  # the recorder was killed before info.json was replaced
 
@@ -299,10 +296,8 @@ def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:
 
 
 def stream_schema(sensor: Sensor) -> pa.Schema:
-    """The schema of a stream's table: its times and, for all but cameras (which have an mp4), its flattened values.
-
-    The metadata holds the Sensor as well, in case meta/terrella.json is lost.
-    """
+    """The schema of a stream's table: its times and, for all but cameras (which have an mp4), its flattened values; with the
+    Sensor in the metadata, in case meta/terrella.json is lost."""
     fields = [pa.field("time_s", pa.float64())]
     if sensor.kind != "image":
         dtype = "uint16" if sensor.kind == "depth" else sensor.dtype

@@ -97,9 +97,8 @@ class Browse:
 
     def episode(self, number: int) -> dict:
         """One episode as JSON: seconds, task, start_ns (as text, too long for a JSON number in a browser), language
-        ([[time_s, text], ...]: changes of the instruction, and the values of text sensors), and each sensor's count and fault.
-
-        A fault says why a sensor cannot be shown; "" if it can.
+        ([[time_s, text], ...]: changes of the instruction, and the values of text sensors), and the count of each sensor and its
+        fault: why it cannot be shown, "" if it can.
         """
         opened = self._take(number)
         sensors, ends = {}, [0.0]
@@ -157,10 +156,7 @@ class Browse:
         self._bad = marked
 
     def export(self, path: Path, keep: Sequence[int], report: Progress) -> tuple[int, list[str]]:
-        """Writes the episodes `keep` into a new folder `path`; may run in its own thread beside other methods.
-
-        Returns the folder's number of episodes, and notes on what was left out or changed.
-        """
+        """Writes the episodes `keep` into a new folder; may run in its own thread. Returns (its number of episodes, notes)."""
         if self._export is None:
             raise DatasetError(f"{self.source.name} was opened without an exporter; open it with browse().")
         for number in keep:

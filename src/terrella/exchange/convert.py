@@ -1,6 +1,6 @@
 """convert: from any format that Terrella knows into any other; the format of a path is recognised from its content."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -23,10 +23,10 @@ class _Kind:
     name: str
     read: str  # "module.function" of `formats`, imported when used: (path, fps) -> Source
     write: str  # likewise: (source, path, progress) -> notes
-    suffixes: frozenset[str] = frozenset()
+    suffixes: Collection[str] = ()
     # "text" (string features), "task", "language", "start_ns", "sensors" (names, units, facts), "facts" (of takes), or
     # single facts of takes by name
-    keeps: frozenset[str] = frozenset()
+    keeps: Collection[str] = ()
 
 
 def _call(function: str, *args: Any, **kwargs: Any) -> Any:
@@ -34,27 +34,15 @@ def _call(function: str, *args: Any, **kwargs: Any) -> Any:
     return getattr(import_module(f".formats.{module}", __package__), name)(*args, **kwargs)
 
 
-_ALL = frozenset({"text", "task", "language", "start_ns", "facts", "sensors"})
+_ALL = {"text", "task", "language", "start_ns", "facts", "sensors"}
 _KINDS: dict[str, _Kind] = {
     "lerobot": _Kind("LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL),  # its writer notes what it leaves out
-    "mcap": _Kind("MCAP", "mcap.read", "mcap_write.write", frozenset({".mcap"}), _ALL - {"text"}),
-    "minari": _Kind(
-        "Minari", "minari.read", "minari.write", keeps=frozenset({"task", "start_ns", "sensors", "minari", "texts"})
-    ),
+    "mcap": _Kind("MCAP", "mcap.read", "mcap_write.write", (".mcap",), _ALL - {"text"}),
+    "minari": _Kind("Minari", "minari.read", "minari.write", (), ("task", "start_ns", "sensors", "minari", "texts")),
     "robomimic": _Kind(
-        "HDF5",
-        "hdf5.read",
-        "robomimic.write",
-        frozenset({".hdf5", ".h5", ".hdf"}),
-        frozenset({"task", "sensors", "robomimic"}),
+        "HDF5", "hdf5.read", "robomimic.write", (".hdf5", ".h5", ".hdf"), ("task", "sensors", "robomimic")
     ),
-    "rollouts": _Kind(
-        "npz rollouts",
-        "rollouts.read",
-        "rollouts.write",
-        frozenset({".npz"}),
-        frozenset({"task", "start_ns", "sensors"}),
-    ),
+    "rollouts": _Kind("npz rollouts", "rollouts.read", "rollouts.write", (".npz",), ("task", "start_ns", "sensors")),
     "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS),
     "images": _Kind("images", "images.read", "images.write", IMAGES),
 }
@@ -72,8 +60,7 @@ def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, 
     """
     name = str(path)
     if name.startswith("gym:"):
-        env = name.removeprefix("gym:")
-        return _call("environments.from_env", env, episodes=episodes, seed=seed, fps=fps)
+        return _call("environments.from_env", name.removeprefix("gym:"), episodes=episodes, seed=seed, fps=fps)
     kind = _KINDS["lerobot" if "://" in name else _kind(Path(path))]
     return _call(kind.read, name if "://" in name else Path(path), fps=fps)
 
@@ -101,7 +88,7 @@ def _kind(path: Path) -> str:
 
 
 def _by_suffix(suffixes: set[str]) -> str | None:
-    return next((name for name, kind in _KINDS.items() if suffixes & kind.suffixes), None)
+    return next((name for name, kind in _KINDS.items() if suffixes.intersection(kind.suffixes)), None)
 
 
 def format_of(path: str | Path) -> str:

@@ -57,10 +57,7 @@ class Live:
         return getattr(self._out, "port", None)
 
     def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None:
-        """Logs a copy of a reading, `time_s` seconds after `start_ns`.
-
-        A vector is cast to its sensor's dtype; pictures, depth and points must have it.
-        """
+        """Logs a copy of a reading, `time_s` seconds after `start_ns`. Only vectors are cast to their sensor's dtype."""
         sensor = self._sensors.get(sensor_name)
         if sensor is None:
             return self._lose(f"'{sensor_name}' is not a declared sensor; declare it, or do not log it.")

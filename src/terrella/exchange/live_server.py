@@ -1,8 +1,7 @@
 """A WebSocket server on this machine, Foxglove's own, that the Foxglove app connects to for live sensors.
 
-Foxglove's server accepts every connection (measured: foxglove-sdk 0.30 accepts any Origin and Host), so that any web page in
-a local browser could watch a robot's cameras. A gate in front of it admits only the Foxglove app, local pages and programs;
-the server itself listens on a random loopback address.
+It accepts every connection (measured: foxglove-sdk 0.30 accepts any Origin and Host), even of web pages. So it listens on a
+random loopback address, and a gate in front of it admits only the Foxglove app, local pages and programs.
 """
 
 import asyncio
@@ -34,10 +33,8 @@ _REFUSED = b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\nConnection: close\r\
 
 
 class LiveServer:
-    """Serves the sensors' readings until closed. A reading is encoded only if a client subscribes to its sensor.
-
-    Clients connect to `port`. DatasetError where the port is not available.
-    """
+    """Serves the sensors' readings on `port` until closed; a reading is encoded only if a client subscribes to its sensor.
+    DatasetError where the port is not available."""
 
     def __init__(self, port: int, sensors: Mapping[str, Sensor], name: str):
         self._sensors, self._context = sensors, (context := foxglove.Context())  # channels end with their context

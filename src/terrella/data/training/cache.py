@@ -342,8 +342,7 @@ def fill_episode(
     at = episode.start + first if at is None else at
     count = episode.length - first if count is None else count
     pictured = [name for name in arrays if name == "rgb" or name in dataset.cameras]
-    rows = dataset.episode(number, [name for name in arrays if name not in pictured])
-    for name, values in rows.items():
+    for name, values in dataset.episode(number, [name for name in arrays if name not in pictured]).items():
         array = arrays[name]
         array[at : at + count] = values[first : first + count].reshape(count, *array.shape[1:])
     for name in pictured:

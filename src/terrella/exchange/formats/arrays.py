@@ -1,8 +1,5 @@
-"""Episodes of named arrays, as HDF5, Minari and .npz store them: a table says which array is which sensor.
-
-A format lists the arrays of an episode (`Array`, by place) and says what the first key of a place means (`names`).
-`columns` makes sensors of them, `readings` the readings of a take, and `source` the whole source.
-"""
+"""Episodes of named arrays, as HDF5, Minari and .npz store them: a format lists the arrays of an episode (`Array`, by place)
+and says what the first key of a place means (`names`); sensors, readings and the whole source are made of these."""
 
 import io
 import math
@@ -75,9 +72,8 @@ def spelled(place: Place) -> str:
 
 
 def sensor_at(names: Mapping[str, str], place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
-    """The sensor of an array with rows of that shape, by the first key of its place; None for a key not in the table.
-
-    names: first key -> "observation", "action" or "info" (further keys become the sensor's name), or a whole name.
+    """The sensor of an array with rows of that shape; None for one whose first key is not in `names`: first key ->
+    "observation", "action" or "info" (further keys become the sensor's name), or a whole name.
     """
     name = names.get(str(place[0]))
     if name is None:
@@ -92,10 +88,8 @@ def sensor_at(names: Mapping[str, str], place: Place, shape: tuple[int, ...], dt
 def columns(
     arrays: Mapping[Place, Array], guess: Guess, what: str, described: Mapping[Place, Sensor] | None = None
 ) -> tuple[dict[Place, Sensor], list[str]]:
-    """Place -> sensor for each array that `guess` recognises, and a note on each array that is left out.
-
-    described: the sensors of our own description; each replaces the guess if it fits the array.
-    """
+    """Place -> sensor for each array that `guess` recognises (or of `described`, our own description, where that fits the array),
+    and a note on each array that is left out."""
     sensors: dict[Place, Sensor] = {}
     notes, taken = [], set()
     for place, array in arrays.items():

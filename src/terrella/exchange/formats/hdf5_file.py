@@ -51,10 +51,7 @@ def names_in(parent: Group) -> list[str]:
 
 
 def child(parent: Group, name: str | int) -> Group | Dataset:
-    """parent[name]; DatasetError for links and for datasets that keep their values in other files.
-
-    name: an int i stands for "_index_i", Minari's key of entry i of a Tuple.
-    """
+    """parent[name], or entry `name` of one of Minari's Tuples; DatasetError for links and for values in other files."""
     name = f"_index_{name}" if isinstance(name, int) else name
     where = f"{parent.file.filename}{parent.name.rstrip('/')}/{name}"
     try:
@@ -109,10 +106,8 @@ def all_datasets(parent: Group, place: tuple[str, ...] = ()) -> Iterator[tuple[t
 
 
 def concatenated(file: File, count: int, *pieces: tuple[Place, int, int]) -> Array:
-    """Rows of several datasets, concatenated. Each piece is (place, first row, end row) of a dataset of `count` rows.
-
-    If `file` is closed by the time rows are read, it is opened once more.
-    """
+    """Rows of several datasets of `count` rows each, concatenated; pieces are (place, first row, end row). A file that is closed
+    by the time rows are read is opened once more."""
     path = Path(file.filename)
     held = [numeric(subgroup(file, *names[:-1]), names[-1], count) for names, _, _ in pieces]
 

@@ -387,11 +387,8 @@ def topics(sensors: Mapping[str, Sensor]) -> dict[str, str]:
 
 
 def key_of(topic: str, sensor: Sensor) -> str:
-    """The name of a topic's sensor: our own topics keep their names, others go under their kind.
-
-    "/observation/images/front" -> "observation.images.front";
-    "/camera/front/image" -> "observation.images.camera_front_image".
-    """
+    """The name of a topic's sensor: our own topics keep their names ("/observation/images/front" is observation.images.front),
+    others go under their kind ("/camera/front/image" is observation.images.camera_front_image)."""
     under = _KEYS.get(sensor.kind, "observation")
     ours = topic.removeprefix("/").replace("/", ".")
     if ours == under or ours.startswith(under + "."):

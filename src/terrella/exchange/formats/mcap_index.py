@@ -1,8 +1,5 @@
-"""The position of every intact message of an MCAP file; the `mcap` package parses the records.
-
-The package's own reader stops at the first damage and gives no access by number. Here the file is scanned record by record,
-so that a damaged record costs only itself. Layout: https://mcap.dev/spec.
-"""
+"""The position of every intact message of an MCAP file (https://mcap.dev/spec), scanned record by record, so that a damaged
+record costs only itself: the reader of the `mcap` package stops at the first damage and gives no access by number."""
 
 import io
 import os
@@ -46,10 +43,8 @@ class Messages:
 
 
 class Index:
-    """The schemas, channels, metadata and messages of one file; damaged parts are left out, with a note.
-
-    Every chunk is unpacked once to check its checksum. DatasetError where the file is not MCAP.
-    """
+    """The schemas, channels, metadata and messages of one file. Damaged parts (every chunk's checksum is compared) are left out,
+    with a note; DatasetError where the file is not MCAP."""
 
     def __init__(self, path: Path):
         self.path = path

@@ -66,8 +66,7 @@ def _write_take(source: Source, take: Take, path: Path, progress) -> None:
     with McapRecording(path, sensors, source, take, zero_ns) as recording:
         for done, at in enumerate(order.tolist()):
             name, i = names[whose[at]], int(which[at])
-            value = np.asarray(take.readings[name].values[i])
-            recording.add(name, zero_ns + int(times[whose[at]][i]), value)
+            recording.add(name, zero_ns + int(times[whose[at]][i]), np.asarray(take.readings[name].values[i]))
             if progress:
                 progress(done + 1, len(order))
 

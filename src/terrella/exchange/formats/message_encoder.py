@@ -149,10 +149,8 @@ def _place(value: np.ndarray) -> tuple[fox.Vector3, fox.Quaternion]:
 
 @cache
 def _vector_file() -> Any:
-    """terrella.Vector {timestamp, values, names, integers}, because Foxglove has no message for a named vector.
-
-    `integers` repeats the values of 64-bit integers, which doubles would round.
-    """
+    """terrella.Vector {timestamp, values, names, integers}, for Foxglove has no message for a named vector. `integers` repeats the
+    values of 64-bit integers, which doubles would round."""
     kind = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="terrella/Vector.proto", package="terrella", syntax="proto3")
     file.dependency.append(timestamp_pb2.DESCRIPTOR.name)

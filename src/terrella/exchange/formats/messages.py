@@ -146,8 +146,7 @@ def fit(reading: Reading, sensor: Sensor) -> np.ndarray:
             return value.view(np.uint64).reshape(sensor.shape)
         with np.errstate(invalid="ignore"):
             return value.astype(target).reshape(sensor.shape)
-    same = value.shape[1:] == sensor.shape[1:] if sensor.kind == "points" else value.shape == sensor.shape
-    if not same:
+    if not (value.shape[1:] == sensor.shape[1:] if sensor.kind == "points" else value.shape == sensor.shape):
         raise DatasetError(f"it is {list(value.shape)} where '{sensor.name}' is {list(sensor.shape)}")
     return value
 

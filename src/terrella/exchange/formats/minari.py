@@ -1,8 +1,5 @@
-"""Reads and writes Minari datasets (0.5) without the `minari` package.
-
-The package decodes whole episodes at once and makes the environment that the metadata names. Its files are few and documented,
-so they are read here one value at a time, and no code that they name is run.
-"""
+"""Reads and writes Minari datasets (0.5) without the `minari` package, which decodes whole episodes at once and makes the
+environment that the metadata names. Here values are read one at a time, and no code that the files name is run."""
 
 import json
 import math

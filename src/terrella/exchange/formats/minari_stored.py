@@ -54,8 +54,7 @@ class TableEpisode:
         if not parts:
             raise DatasetError(f"{folder} has no .{kind} file; restore the episode from a copy.")
         try:
-            tables = [_arrow(part) if kind == "arrow" else _parquet(part) for part in parts]
-            table = pa.concat_tables(tables)
+            table = pa.concat_tables([_arrow(part) if kind == "arrow" else _parquet(part) for part in parts])
             table.validate(full=True)
             columns = {name: table.column(name).combine_chunks() for name in table.column_names}
             self._leaves = {place: leaf for name, column in columns.items() for place, leaf in _leaves(column, (name,))}
@@ -119,8 +118,7 @@ def _arrow(path: Path) -> pa.Table:
 
 def _parquet(path: Path) -> pa.Table:
     with pq.ParquetFile(path) as file:
-        width = sum(_width(field.type) for field in file.schema_arrow)
-        if file.metadata.num_rows * width > rows.MAX_BYTES:
+        if file.metadata.num_rows * sum(_width(field.type) for field in file.schema_arrow) > rows.MAX_BYTES:
             raise DatasetError(f"{path} claims {file.metadata.num_rows} rows; restore it from a copy.")
         return file.read()
 

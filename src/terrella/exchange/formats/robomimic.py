@@ -26,11 +26,10 @@ _FLAGS = ("dones", "truncated")
 
 
 def read(path: Path, fps: float | None) -> Source:
-    """A robomimic file as a Source.
+    """A robomimic file as a Source. A demo with next_obs has one more observation than actions.
 
-    A demo with next_obs has one more observation than actions. The simulator's states become "info.states". Filter keys
-    (facts["robomimic"]["mask"]), env_args and attributes are kept as facts. An instruction (ep_meta's lang, LIBERO's
-    problem_info) becomes the take's task.
+    The simulator's states become "info.states"; filter keys (facts["robomimic"]["mask"]), env_args and attributes are kept as
+    facts; an instruction (ep_meta's lang, LIBERO's problem_info) becomes the take's task.
     """
     with hdf5_file.open_file(path) as file:
         data = hdf5_file.subgroup(file, "data")

@@ -78,13 +78,9 @@ def _arrays(path: Path) -> dict[Place, Array]:
                 if not info.filename.endswith(".npy"):
                     continue
                 with file.open(info) as member:
-                    version = np.lib.format.read_magic(member)
-                    header = (
-                        np.lib.format.read_array_header_1_0
-                        if version == (1, 0)
-                        else np.lib.format.read_array_header_2_0
-                    )
-                    shape, _, dtype = header(member)
+                    first = np.lib.format.read_magic(member) == (1, 0)
+                    name = f"read_array_header_{1 if first else 2}_0"
+                    shape, _, dtype = getattr(np.lib.format, name)(member)
                 key = info.filename.removesuffix(".npy")
                 size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
                 if dtype.hasobject or size > min(rows.MAX_BYTES, info.file_size):

@@ -101,8 +101,7 @@ def to_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
         return values.reshape(len(values), *shape)
     if shape[0] == 3:
         return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
-    grey = np.rint(values.mean(axis=3, dtype=np.float64)).astype(np.uint8)
-    return grey.reshape(len(values), *shape)
+    return np.rint(values.mean(axis=3, dtype=np.float64)).astype(np.uint8).reshape(len(values), *shape)
 
 
 def check_size(height: int, width: int, what: str) -> None:

@@ -107,8 +107,7 @@ def expanded(space):
 
 def _spread(bound, shape: tuple[int, ...], dtype: str) -> list:
     whole = np.dtype(dtype).kind in "iub"  # float64 would lose the last digits of an int64
-    array = np.array(bound, dtype=object if whole else np.float64)
-    return np.broadcast_to(array, shape).tolist()
+    return np.broadcast_to(np.array(bound, dtype=object if whole else np.float64), shape).tolist()
 
 
 def _bound(values: np.ndarray):

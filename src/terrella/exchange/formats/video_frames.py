@@ -72,10 +72,8 @@ class FrameReader:
 
 
 def decodable_messages(read: Callable[[int], bytes], after_gap: np.ndarray, format: str) -> np.ndarray:
-    """int64 [m], ascending: the messages that can be decoded, from each keyframe up to the next gap.
-
-    read: (i) -> the data of message i. after_gap: bool [n], whether messages are missing just before message i.
-    """
+    """int64 [m]: the messages, of data `read(i)`, that can be decoded: from each keyframe to the next gap. after_gap: bool [n],
+    whether messages are missing just before message i."""
     if format not in _CODECS:
         raise DatasetError(f"its video is '{format}', and only h264 and h265 are read")
     numbers, decodable = [], False

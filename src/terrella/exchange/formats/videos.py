@@ -124,10 +124,8 @@ def _decoded(path: Path, seek_to: int | None) -> Iterator[av.VideoFrame]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video and its first picture stream; FFmpeg's errors become a DatasetError.
-
-    FFmpeg gets an open file and may open no other, so that a playlist cannot lead it out of the folder.
-    """
+    """A video and its first picture stream; FFmpeg's errors become a DatasetError. FFmpeg gets an open file and may open no other,
+    so that a playlist cannot lead it out of the folder."""
     try:
         with open(path, "rb") as file, av.open(file, "r", options={"protocol_whitelist": "none"}) as container:
             if not container.streams.video or container.streams.video[0].codec_context is None:

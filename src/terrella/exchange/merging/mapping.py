@@ -49,11 +49,8 @@ class MergedCamera:
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a sensor: it fills the dimension `to`, or is left out for the reason `out`.
-
-    The dimension is scale * number + offset. If `scale` is None, the number is converted from `unit` to the dimension's unit,
-    where both are stated.
-    """
+    """One number of a sensor: it fills the dimension `to` with scale * number + offset, or is left out for the reason `out`. With
+    `scale` None it is converted from `unit` to the dimension's unit, where both are stated."""
 
     name: str = ""
     to: str = ""

@@ -102,10 +102,8 @@ def merge(
 
 
 def letterbox(picture: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Fits an image (uint8 [H, W, 3]) or depth (float32 [H, W]) into height x width, centred, with its aspect ratio kept.
-
-    Images are downscaled by Pillow's box filter and upscaled bilinearly, on black; depth takes the nearest pixels, on inf.
-    """
+    """Fits an image (uint8 [H, W, 3]; box filter or bilinear, on black) or depth (float32 [H, W]; nearest pixels, on inf) into
+    height x width, centred, with its aspect ratio kept."""
     if picture.shape[:2] == (height, width):
         return picture
     down, across, top, left = fit(picture.shape[0], picture.shape[1], height, width)
@@ -116,8 +114,7 @@ def letterbox(picture: np.ndarray, height: int, width: int) -> np.ndarray:
         inner = picture[rows.astype(int)[:, None], columns.astype(int)]
     else:
         fitted = np.zeros((height, width, 3), np.uint8)
-        smaller = down <= picture.shape[0]
-        filter = Image.Resampling.BOX if smaller else Image.Resampling.BILINEAR
+        filter = Image.Resampling.BOX if down <= picture.shape[0] else Image.Resampling.BILINEAR
         inner = np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize((across, down), filter))
     fitted[top : top + down, left : left + across] = inner
     return fitted

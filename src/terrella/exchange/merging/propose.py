@@ -96,8 +96,7 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
         vectors: dict[str, list[Number]] = {}
         for place in places:
             if place.source == path:
-                number = Number(place.name, filled[place], place.unit)
-                vectors.setdefault(place.sensor, []).append(number)
+                vectors.setdefault(place.sensor, []).append(Number(place.name, filled[place], place.unit))
         views = {name: name for name, it in source.sensors.items() if name in cameras and it.kind == cameras[name].kind}
         keep, out = _rest(source, names[path] if several else "", cameras, {*vectors, *views})
         mapped.append(

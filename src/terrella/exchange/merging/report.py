@@ -72,11 +72,8 @@ class SourceCount:
 
 
 class MergeReport:
-    """Filled while the takes of a merged source are read; each iteration starts it again.
-
-    complete: whether the last iteration reached the end.
-    sources:  path -> SourceCount.
-    """
+    """Filled while the takes of a merged source are read, anew at each iteration. complete: whether the last one reached the end;
+    sources: path -> SourceCount."""
 
     def __init__(self) -> None:
         self.complete = False
@@ -97,8 +94,7 @@ class MergeReport:
 
     def embodiments(self) -> list[dict]:
         """For meta/terrella.json: each robot's number, name, sources, cameras, takes, rows, and statistics of action and state:
-        name -> min, max, mean, std, q01, q99, count over its valid rows, for the numbers that it has.
-        """
+        name -> min, max, mean, std, q01, q99, count over its valid rows, for the numbers that it has."""
         robots = []
         for number, (name, facts) in enumerate(self._robots.items()):
             own = [source for source in self.sources.values() if source.embodiment == name]

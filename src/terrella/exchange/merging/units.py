@@ -61,10 +61,8 @@ def basic(unit: str) -> str:
 
 
 def convert(unit: str, to: str) -> tuple[float, float]:
-    """(scale, offset): x in `unit` is scale * x + offset in `to`. (1, 0) where they are equal or one is "".
-
-    DatasetError where the quantities differ, or the units differ and one is unknown.
-    """
+    """(scale, offset): x in `unit` is scale * x + offset in `to`; (1, 0) where they are equal or one is "". DatasetError where the
+    quantities differ, or the units differ and one is unknown."""
     if unit == to or not unit or not to:
         return 1.0, 0.0
     a, b = _lookup(unit), _lookup(to)
