@@ -61,8 +61,7 @@ class Actor:
     def load(folder: str | Path, spec: Spec, greedy: bool = True) -> Actor:
         """Loads a saved policy, from its folder or that of the training run. CheckpointError if it is missing or foreign,
         ActionError or ChannelError if `spec` has other actions or lacks a channel."""
-        make = lambda config: ActorNetwork(ActorConfig(**config))  # noqa: E731
-        network, card = load_network(folder, KIND, VERSION, make)
+        network, card = load_network(folder, KIND, VERSION, lambda config: ActorNetwork(ActorConfig(**config)))
         return Actor(network, spec, greedy, card)
 
 

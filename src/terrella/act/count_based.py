@@ -135,7 +135,7 @@ class CountBased:
         return list(self._open)
 
     def act(self, observation: Observation, memory: list, rng: torch.Generator) -> tuple[torch.Tensor, list]:
-        seen = observation[self.channel] if self.channel in observation else None
+        seen = observation.get(self.channel)
         chosen = []
         for entry, play in enumerate(memory):
             first = play.cells is None
@@ -217,16 +217,13 @@ def _arms(spec: Spec) -> torch.Tensor:
     every button, the limits of every axis, and random combinations."""
     rest, (low, high) = neutral_action(spec), spec.action_limits
     if rest.ndim == 0 and rest.dtype.kind != "f":
-        values = np.unique(np.linspace(int(low), int(high), min(int(high) - int(low) + 1, _MAX_ARMS)).round()).astype(
-            rest.dtype
-        )
+        low, high = int(low), int(high)
+        values = np.unique(np.linspace(low, high, min(high - low + 1, _MAX_ARMS)).round()).astype(rest.dtype)
         return torch.from_numpy(np.array([rest, *values[values != rest]]))
-    axes = rest.dtype.kind == "f"
-    ends = (
-        [np.clip(low, -1e3, 1e3), np.clip(high, -1e3, 1e3)]
-        if axes
-        else [low + np.minimum(k, high - low) for k in range(5)]
-    )
+    if rest.dtype.kind == "f":
+        ends = [np.clip(low, -1e3, 1e3), np.clip(high, -1e3, 1e3)]
+    else:
+        ends = [low + np.minimum(k, high - low) for k in range(5)]
     arms = {rest.tobytes(): rest}
     for at, end in [(at, end) for at in range(rest.size) for end in ends][:_MAX_ARMS]:
         one = rest.copy()

@@ -78,8 +78,7 @@ class SquashedGaussian:
 
     def sample(self, rng: torch.Generator) -> torch.Tensor:
         mean, std = self._moments()
-        seeds = chance.seeds(len(mean), rng, mean.device)
-        return mean + std * chance.normal(seeds, mean.shape[1:], _STREAM)
+        return mean + std * chance.normal(chance.seeds(len(mean), rng, mean.device), mean.shape[1:], _STREAM)
 
     def mode(self) -> torch.Tensor:
         return self._moments()[0]

@@ -106,10 +106,10 @@ class _Walk:
 
     def next(self, view: _View) -> tuple[str, ...]:
         """The buttons of the next step."""
-        if self._moves is None:
-            self._moves = self.episode(view)
-            return next(self._moves)
-        return self._moves.send(view)
+        if self._moves is not None:
+            return self._moves.send(view)
+        self._moves = self.episode(view)
+        return next(self._moves)
 
     def episode(self, view: _View) -> _Moves:
         kinds = [self.seek, self.run, self.turn, self.strafe, self.back, self.stop, self.look_around, self.mash]
@@ -168,9 +168,8 @@ class _Walk:
         """Turns to the nearest object at eye height and shoots at it, standing, strafing or walking, the trigger held or pressed at
         times. One fight of five only aims, and one of three aims beside the object, sometimes barely: so recordings separate the
         effect of a hit from that of a shot, and of a shot from that of aiming."""
-        along = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)][
-            random_int(self.rng, 0, 6)
-        ]
+        ways = (), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)
+        along = ways[random_int(self.rng, 0, 6)]
         often = (0.0, 0.3, 0.8, 1.0, 1.0)[random_int(self.rng, 0, 4)]
         beside = 0.0  # radians
         if _chance(self.rng, 1 / 3):
@@ -231,9 +230,8 @@ class _Walk:
 
     def run(self, view: _View) -> _Moves:
         """Straight ahead, sometimes diagonally or while turning, until a wall is near."""
-        extra = [(), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)][
-            random_int(self.rng, 0, 6)
-        ]
+        ways = (), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("TURN_LEFT",), ("TURN_RIGHT",)
+        extra = ways[random_int(self.rng, 0, 6)]
         bump = _chance(self.rng, 0.15)  # recordings should have collisions too
         for _ in range(random_int(self.rng, 8, 40)):
             view = yield from self.step("MOVE_FORWARD", *extra)
@@ -312,9 +310,8 @@ def _look(spec: Spec, observation: Observation, bins: int = 33) -> _View:
     thing = target = torch.full((bins,), torch.inf)
     if "things" in observation:
         far = torch.where(observation["things"][0].bool(), depth, torch.inf)
-        thing, target = (
-            -torch.nn.functional.adaptive_max_pool1d(-rows.amin(0)[None], bins)[0] for rows in (far, far[top:bottom])
-        )
+        pooled = torch.nn.functional.adaptive_max_pool1d
+        thing, target = (-pooled(-rows.amin(0)[None], bins)[0] for rows in (far, far[top:bottom]))
     pose, far = observation["pose"][0], [level / torch.cos(bearing) for level in (level, thing, target)]
     return _View(float(pose[0]), float(pose[1]), float(yaw(pose)), bearing, *far)
 

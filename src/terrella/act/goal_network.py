@@ -103,8 +103,7 @@ class GoalActor:
         latent, goal = observation[LATENT], observation[GOAL]
         goal = goal.to(latent).expand(len(latent), -1)
         steps = self.network.steps(latent, goal) * memory.to(latent)
-        config = self.network.config.actor
-        return config.actions(self.network(latent, goal, steps).mode(), self.spec), memory
+        return self.network.config.actor.actions(self.network(latent, goal, steps).mode(), self.spec), memory
 
     def save(self, folder: str | Path) -> None:
         """Writes the folder, each file atomically; CheckpointError if it cannot be written."""

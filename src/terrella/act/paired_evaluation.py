@@ -159,8 +159,7 @@ class PairedEvaluation:
         episodes: list[PlayedEpisode] = []
         sees, keep = observed_channels(policy, spec), self.compared if kept else ()
         for state in states:
-            left = max(0, kept - len(episodes))
-            settings = PlaySettings(self.steps, self.criterion, sees, keep, left)
+            settings = PlaySettings(self.steps, self.criterion, sees, keep, max(0, kept - len(episodes)))
             episodes += play_from(world, state, policy, settings, later(seed, len(episodes)))
         return episodes
 

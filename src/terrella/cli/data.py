@@ -164,8 +164,7 @@ def view(
         result({"address": address, "dataset": folder}, json, f"{folder}: open {address}")
 
     here = Path(folder).resolve() if "://" not in folder else Path.cwd() / folder.rstrip("/").rsplit("/", 1)[-1]
-    good = out or here.with_name(f"{here.name}-good")
-    serve(browse(folder, carry=repair), port, host, token, ready, good)
+    serve(browse(folder, carry=repair), port, host, token, ready, out or here.with_name(f"{here.name}-good"))
 
 
 def label(

@@ -31,5 +31,4 @@ def play(
         if worlds[-1].spec.card.get("kind") == "splat":
             say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
 
-    page = ServeConfig(host, port, token, seed)
-    workflow.play(name, config, controls, page, on_ready=ready, progress=say)
+    workflow.play(name, config, controls, ServeConfig(host, port, token, seed), on_ready=ready, progress=say)

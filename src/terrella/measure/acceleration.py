@@ -41,18 +41,15 @@ class EnergyMeter:
         return "RAPL, the whole processor" if self.files else f"estimated: {WATTS_OF_A_CORE:g} W per busy core"
 
     def joules(self) -> float:
-        if self.files:
-            return (
-                sum((now - then) % most for now, then, most in zip(self._readings(), self._first, self._ranges())) / 1e6
-            )
-        return WATTS_OF_A_CORE * (time.process_time() - self._busy)
+        if not self.files:
+            return WATTS_OF_A_CORE * (time.process_time() - self._busy)
+        most = [
+            int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files
+        ]  # then it wraps around
+        return sum((now - then) % wrap for now, then, wrap in zip(self._readings(), self._first, most)) / 1e6
 
     def _readings(self) -> list[int]:
         return [int(file.read_text()) for file in self.files]
-
-    def _ranges(self) -> list[int]:
-        """The value at which each counter wraps around."""
-        return [int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files]
 
 
 @torch.inference_mode()

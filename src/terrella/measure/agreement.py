@@ -44,8 +44,7 @@ def mean_maximum_rank_violation(dream: torch.Tensor, real: torch.Tensor) -> torc
     """MMRV (Li et al. 2024, SIMPLER): for each policy, the largest real difference to a policy that the dream ranks on the wrong
     side of it; the mean over policies [..., P], in the unit of the real scores."""
     wrong = (dream[..., :, None] > dream[..., None, :]) != (real[..., :, None] > real[..., None, :])
-    gap = (real[..., :, None] - real[..., None, :]).abs().double()
-    return (gap * wrong).amax(-1).mean(-1)
+    return ((real[..., :, None] - real[..., None, :]).abs().double() * wrong).amax(-1).mean(-1)
 
 
 def agreement(dream: torch.Tensor, real: torch.Tensor, rng: torch.Generator, scale: float | None = None) -> Agreement:

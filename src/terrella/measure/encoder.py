@@ -49,8 +49,7 @@ class FrameEncoder(nn.Module):
         for number, conv in enumerate(self.convs):
             x = F.leaky_relu(conv(x), 0.1)
             if number in _TAPS:
-                spread = (x.var((2, 3), correction=0) + 1e-4).sqrt()
-                statistics += [x.mean((2, 3)), spread]
+                statistics += [x.mean((2, 3)), (x.var((2, 3), correction=0) + 1e-4).sqrt()]
         return torch.cat(statistics, 1)
 
 

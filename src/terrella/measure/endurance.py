@@ -144,8 +144,7 @@ def rows_of(
         report.rows.append(Row(*where, steps, worst, 0, natural, note=note))
         if name in _DRAWN:
             value, low_, high_ = ([getattr(figure, key) for figure in figures] for key in ("value", "low", "high"))
-            band = Band(value, low_, high_, len(clips))
-            report.curves.append(Curve(*where, x, band, guides=(0.7, 1.0, 1.3)))
+            report.curves.append(Curve(*where, x, Band(value, low_, high_, len(clips)), guides=(0.7, 1.0, 1.3)))
     report.pictures.append(_picture("endurance", arm, gone, x))
     return report
 

@@ -147,8 +147,7 @@ def _ticks(curves: Sequence[Curve], log: bool) -> list[tuple[float, str]]:
 
 def _line(card: Scorecard, curve: Curve) -> Line:
     copied = curve.arm == COPY_LAST
-    arm = curve.arm.partition(",")[0]
-    colour = QUIET if copied else COLOURS[list(card.worlds).index(arm) % len(COLOURS)]
+    colour = QUIET if copied else COLOURS[list(card.worlds).index(curve.arm.partition(",")[0]) % len(COLOURS)]
     dotted, dashed = copied or curve.arm.endswith("oracle"), curve.motion == TRUE or "chance" in curve.arm
     dash = "2 3" if dotted else "5 4" if dashed else ""
     band = curve.band

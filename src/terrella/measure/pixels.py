@@ -172,8 +172,7 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
             baselines = {COPY_LAST: mean_interval(truth[f"{name}/copied_ssim"][:, number], exam.rng())}
             figure = mean_interval(dreamt[f"{name}/ssim"][:, number], exam.rng())
             rows.append(Row(probe, name, "SSIM", "", place, arm, motion, step, figure, 1, baselines))
-        still = truth[f"{name}/first"].flatten()
-        baselines = {COPY_LAST: ratio_interval(still, real[:, step - 1], exam.rng())}
+        baselines = {COPY_LAST: ratio_interval(truth[f"{name}/first"].flatten(), real[:, step - 1], exam.rng())}
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
         rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
         mine_change, change = (

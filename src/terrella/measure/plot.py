@@ -54,10 +54,9 @@ def line_chart(
         x = at(value, bottom)[0]
         parts.append(f'<path class="grid" d="M{x} {height - _BOTTOM}v4"/>')
         parts.append(f'<text x="{x}" y="{height - _BOTTOM + 17}" text-anchor="middle">{escape(label)}</text>')
-    for value in guides:
-        parts.append(f'<path class="guide" d="M{_LEFT} {at(lines[0].x[0], value)[1]}H{width - margin}"/>')
-    for line in lines:
-        parts.append(_band_path(line, at))
+    ys = [at(lines[0].x[0], value)[1] for value in guides]
+    parts += [f'<path class="guide" d="M{_LEFT} {y}H{width - margin}"/>' for y in ys]
+    parts += [_band_path(line, at) for line in lines]
     for line in lines:
         points = [at(x, y) for x, y in zip(line.x, line.y) if math.isfinite(y)]
         dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""

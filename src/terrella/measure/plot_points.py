@@ -28,9 +28,8 @@ def scatter(points: Sequence[ScatterPoint], x_label: str, y_label: str) -> str:
     across, up = _SIDE - _LEFT - _RIGHT, _SIDE - _TOP - _BOTTOM
 
     def at(x: float, y: float) -> tuple[float, float]:
-        return round(_LEFT + (x - low) / (high - low) * across, 1), round(
-            _SIDE - _BOTTOM - (y - low) / (high - low) * up, 1
-        )
+        right, above = (x - low) / (high - low) * across, (y - low) / (high - low) * up
+        return round(_LEFT + right, 1), round(_SIDE - _BOTTOM - above, 1)
 
     parts = [f'<svg viewBox="0 0 {_SIDE} {_SIDE}" role="img" aria-label="{escape(y_label)} against {escape(x_label)}">']
     for value in round_ticks(low, high):

@@ -161,17 +161,14 @@ def verdict(evaluation: PolicyEvaluation) -> list[str]:
         best = max(evaluation.policies, key=lambda name: rows[name][DREAM].value)
         floor = f"; acting at random {say(rows[RANDOM][DREAM])}" if RANDOM in rows and best != RANDOM else ""
         hint = "give --real ENV to compare with reality."
-        return [
-            f"In the dream the best of {count} is {best}, {evaluation.what} {say(rows[best][DREAM])}{floor}; {hint}"
-        ]
+        best = f"{best}, {evaluation.what} {say(rows[best][DREAM])}"
+        return [f"In the dream the best of {count} is {best}{floor}; {hint}"]
     lines = [_ranking(evaluation)]
     if count >= LEAST:
-        lines.append(_figures("dream", evaluation.dream, evaluation))
-        lines.append(_control(evaluation))
+        lines += [_figures("dream", evaluation.dream, evaluation), _control(evaluation)]
         if evaluation.itself is not None and math.isfinite(evaluation.itself.spearman.value):
-            lines.append(
-                f"upper bound, real episodes against real episodes from other starts: {_correlations(evaluation.itself)}"
-            )
+            bound = _correlations(evaluation.itself)
+            lines.append(f"upper bound, real episodes against real episodes from other starts: {bound}")
     return [*lines, *_score_errors(evaluation), *_open_loop_errors(evaluation)]
 
 

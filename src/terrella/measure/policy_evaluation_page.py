@@ -92,8 +92,7 @@ def _errors(evaluation: PolicyEvaluation) -> str:
         svg = line_chart(
             lines, ticks, "steps", "expected error" if is_uncertainty else "distance to reality", True, span
         )
-        keys = legend(lines)
-        boxes += f"<figure><h3>{escape(title)}</h3>{svg}{keys}</figure>"
+        boxes += f"<figure><h3>{escape(title)}</h3>{svg}{legend(lines)}</figure>"
     return f"<div class=charts>{boxes}</div>" if boxes else ""
 
 

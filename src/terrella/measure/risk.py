@@ -61,7 +61,8 @@ def risk_coverage_report(
         report.rows.append(Row(*where, what, "%", place, arm, motion, steps, figure, better, baselines))
     at = [max(1, round(len(wrong) * (k + 1) / POINTS)) - 1 for k in range(POINTS)]
     x = [100 * (k + 1) / len(wrong) for k in at]
-    running = [_running(wrong[order])[at].tolist() for order in orders] + [[float(chance[0])] * POINTS]
+    count = torch.arange(1, len(wrong) + 1)
+    running = [(wrong[order].cumsum(0) / count)[at].tolist() for order in orders] + [[float(chance[0])] * POINTS]
     for name, y in zip(_ORDERS, running):
         band = Band(y, y, y, clips)
         report.curves.append(Curve(*where, "mean error of the surest", "%", place, f"{arm}, {name}", motion, x, band))
@@ -111,7 +112,3 @@ def _area(weights: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
     covered = weights.cumsum(1)
     running = (weights * error).cumsum(1) / covered.clamp_min(1e-12)
     return (weights * running).sum(1) / covered[:, -1]
-
-
-def _running(error: torch.Tensor) -> torch.Tensor:
-    return error.cumsum(0) / torch.arange(1, len(error) + 1)

@@ -86,8 +86,7 @@ def clopper_pearson(successes: int, count: int) -> Figure:
         return (low + high) / 2
 
     low = solve(successes, 0.025) if successes else 0.0
-    high = solve(successes + 1, 0.975) if successes < count else 1.0
-    return Figure(successes / count, low, high, count)
+    return Figure(successes / count, low, solve(successes + 1, 0.975) if successes < count else 1.0, count)
 
 
 def ratio_interval(top: torch.Tensor, bottom: torch.Tensor, rng: torch.Generator) -> Figure:
@@ -121,8 +120,7 @@ def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Genera
         """Means [..., T] -> steps before the first that is below 0: [...]."""
         return (means >= -1e-9).cumprod(-1).sum(-1).double()
 
-    centre = last(over.mean(0))
-    return figure_of(centre, last(_weights(len(over), rng) @ over / len(over)), len(over))
+    return figure_of(last(over.mean(0)), last(_weights(len(over), rng) @ over / len(over)), len(over))
 
 
 def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Generator) -> Band:

@@ -84,9 +84,9 @@ class Store:
     def put(self, key: str, result: Results) -> None:
         if self.folder is None:
             return
-        with writing(self.folder):
-            with replacing(self.folder / f"{_digest(key)}.safetensors", durable=False) as staged:
-                save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, staged)
+        file = self.folder / f"{_digest(key)}.safetensors"
+        with writing(self.folder), replacing(file, durable=False) as staged:
+            save_file({name: tensor.contiguous().clone() for name, tensor in result.items()}, staged)
 
 
 def _digest(text: str) -> str:

@@ -113,7 +113,11 @@ def measure_acceleration(
     real = None if config.beside is None else _without_pictures(config.beside)
     arms = {"world": mine, **({"beside": real} if real else {})}
     for one in arms.values():
-        if one.spec.action_mode in (BUTTONS, CHOICE) or not one.spec.forkable or not _has_limits(one):
+        if (
+            one.spec.action_mode in (BUTTONS, CHOICE)
+            or not one.spec.forkable
+            or not np.isfinite(one.spec.action_limits).all()
+        ):
             raise TerrellaError(
                 f"{one.spec.name} is no world of many streams with axes that have limits; give another."
             )
@@ -159,10 +163,6 @@ def _without_pictures(name: str) -> World:
     if not name.startswith("mujoco:"):
         return library.load(name)
     return library.load(name, cameras=(), threads=torch.get_num_threads())
-
-
-def _has_limits(world: World) -> bool:
-    return all(bool(np.isfinite(limit).all()) for limit in world.spec.action_limits)
 
 
 def _median(rows: list[Throughput]) -> Throughput:

@@ -194,9 +194,8 @@ def _criterion(config: EvaluateConfig, goal: Mapping[str, Any], dream: Spec, rea
     if config.success:
         for spec in (dream, *([real.spec] if real else [])):
             if config.success not in spec.channels:
-                raise PlanningError(
-                    f"{spec.name} has no channel '{config.success}'; it has {', '.join(spec.channels)}."
-                )
+                known = ", ".join(spec.channels)
+                raise PlanningError(f"{spec.name} has no channel '{config.success}'; it has {known}.")
         return SuccessCriterion({}, config.within, config.success)
     hidden = [name for name in goal if real is not None and name not in real.spec.channels]
     if hidden:

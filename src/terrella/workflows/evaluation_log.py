@@ -16,6 +16,7 @@ from ..act.planning import PlayedEpisode
 from ..core.errors import TerrellaError
 from ..core.files import write_json
 from ..measure.policy_evaluation import CONTROL, DREAM, REAL, RETURN, SUCCESS
+from .results import jsonable
 
 SAVED_EVERY_S = 5.0
 _DIGITS = 6
@@ -87,7 +88,8 @@ class EvaluationLog:
                 for measure, values in _measured(episodes).items():
                     measures[measure] = [*measures.get(measure, [])[:first], *values]
         for channel, curve in chunk.open_loop_errors.items():
-            known["followed"][channel] = [_rounded(value) for value in curve.double().nanmean(0).tolist()]
+            mean = curve.double().nanmean(0).tolist()
+            known["followed"][channel] = [jsonable(round(value, _DIGITS)) for value in mean]
         if time.monotonic() - self._saved > SAVED_EVERY_S:
             self.save()
 
@@ -150,7 +152,3 @@ def _measured(episodes: list[PlayedEpisode]) -> dict[str, list[Any]]:
     if episodes[0].success is not None:
         values[SUCCESS] = [bool(episode.success) for episode in episodes]
     return values
-
-
-def _rounded(value: float) -> float | None:
-    return round(value, _DIGITS) if math.isfinite(value) else None

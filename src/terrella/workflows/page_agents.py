@@ -131,8 +131,7 @@ class PageAgents:
         def away(state: State) -> float:
             return float(distance(self.played.spec, aim, self.played.render(state, list(aim)))[0])
 
-        name = "a planner, to the goal"
-        return Agent(name, planner, self.see, away, _NEAR, futures=self._futures(planner))
+        return Agent("a planner, to the goal", planner, self.see, away, _NEAR, futures=self._futures(planner))
 
     def _walking(self, world: World, pose: torch.Tensor) -> Agent:
         """A walker to a pose [7]; NaN matches any value."""

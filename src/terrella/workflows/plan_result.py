@@ -14,6 +14,7 @@ from ..act.planning import PlayedEpisode, distance
 from ..core.files import write_json
 from ..core.world import make_rng
 from ..measure.plan_page import compute_chart, film, film_strip, plan_page
+from ..measure.policy_evaluation import percent
 from ..measure.statistics import Figure
 from .compute_curve import CurvePoint, conclusion, figures_of, gain
 from .plan_study import PlannedEpisodes, PlanStudy
@@ -89,8 +90,8 @@ def _lines(
     """The outcome, for people."""
     lines, episodes = [], played.planner.episodes
     if "success" in planner:
-        beside = f"; at random {_share(random['success'])}" if random else ""
-        lines.append(f"reached in {_share(planner['success'])} of {len(episodes)} episodes{beside}")
+        beside = f"; at random {percent(random['success'])}" if random else ""
+        lines.append(f"reached in {percent(planner['success'])} of {len(episodes)} episodes{beside}")
     if "reward" in study.real.spec.channels or not lines:
         beside = f"; at random {random['return']}" if random else ""
         lines.append(f"return {planner['return']}{beside}")
@@ -122,10 +123,6 @@ def _never_reached(study: PlanStudy, episodes: Sequence[PlayedEpisode]) -> str:
     away = f"; the nearest that it came is {nearest:.3g} (asked: {study.within:g})" if measured else ""
     cost = f"; the best plan in the world cost {best:.3g}" if math.isfinite(best) else ""
     return f"the goal was never reached{away}{cost}: it may be impossible"
-
-
-def _share(figure: Figure) -> str:
-    return f"{figure.value:.0%} [{figure.low:.0%}, {figure.high:.0%}]"
 
 
 def _plain(figures: Mapping[str, Figure]) -> dict[str, object]:

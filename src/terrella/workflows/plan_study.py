@@ -231,8 +231,7 @@ def _criterion(config: PlanConfig, goal: Mapping[str, torch.Tensor], real: Spec)
             f"{real.name} does not show {', '.join(goal)}, so nobody can tell whether the goal is reached: name a channel that "
             "can with --success."
         )
-    judged = {} if config.success or hidden else goal
-    values = {name: value[None] for name, value in judged.items()}
+    values = {name: value[None] for name, value in ({} if config.success or hidden else goal).items()}
     return SuccessCriterion(values, config.within or WITHIN, config.success or "")
 
 

@@ -100,8 +100,7 @@ def _driver(worlds: list[World], config: PlayConfig) -> Policy | Agents:
 def _sink(world: World, keeper: KeyKeeper, folder: Path | None) -> SinkFactory | None:
     if folder is None:
         return None
-    layout = Layout.of(world.spec)
-    return lambda: Recorder(folder, keeper.with_keys(layout), "play")
+    return lambda: Recorder(folder, keeper.with_keys(Layout.of(world.spec)), "play")
 
 
 def _first_picture(path: Path, world: World) -> torch.Tensor:

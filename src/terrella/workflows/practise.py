@@ -202,8 +202,7 @@ def _round(
             practice = replace(practice, method="ppo", cautious=True, trust=TRUST)
         transferable = number and "latent" not in default_channels(world.spec)  # another world has other latents
         earlier = rounds.policy(best_round([*done, notes])) if transferable else None
-        policy = rounds.policy(number)
-        facts = train_policy(world, name, policy, practice, report, rounds.recording, earlier)
+        facts = train_policy(world, name, rounds.policy(number), practice, report, rounds.recording, earlier)
     return {**notes, "steps": facts["step"], "minutes": minutes}
 
 

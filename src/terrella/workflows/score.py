@@ -126,11 +126,8 @@ def arms_of(
 ) -> tuple[dict[str, World], dict[str, World]]:
     """The world, with its memory and without where it has one; and further arms that take the memory probe only."""
     world = load_named(name, device, fast=fast, progress=progress)
-    spec = world.spec
-    remembers = {"places", "known"} <= set(spec.channels) and {"rgb", "pose"} <= set(
-        spec.observes
-    )  # it adds what it sees
-    if library.is_truth(name) or not remembers:
+    adds = {"places", "known"} <= set(world.spec.channels) and {"rgb", "pose"} <= set(world.spec.observes)
+    if library.is_truth(name) or not adds:
         return {"world": world}, {}
     if quick:
         return {"memory": world}, {}

@@ -101,10 +101,8 @@ def transfer(
     """
     config = config or TransferConfig()
     check_robot(config.sim)
-    if (
-        not config.real_episodes
-        or min(config.episodes, config.seeds, config.practice, config.workers, *config.real_episodes) < 1
-    ):
+    counts = (config.episodes, config.seeds, config.practice, config.workers, *config.real_episodes)
+    if not config.real_episodes or min(counts) < 1:
         raise TerrellaError("--episodes, --seeds, --practice, --workers and --real-episodes are 1 or more.")
     if config.real is not None and not library.is_truth(config.real):
         other = config.gap or config.look or config.looks or config.camera
@@ -112,10 +110,8 @@ def transfer(
             raise TerrellaError(
                 f"{config.real} is a recording, which has no --gap, --dial, --look, --looks, --camera and --arms; leave them out."
             )
-        count = max(config.real_episodes)
-        return transfer_to_recording(
-            config.sim, Path(config.real), config.randomise, count, out=config.out, seed=config.seed
-        )
+        real, count = Path(config.real), max(config.real_episodes)
+        return transfer_to_recording(config.sim, real, config.randomise, count, out=config.out, seed=config.seed)
     experiment = _experiment(config)
     check_pair(experiment)
     folder = Path(config.out or "transfers/" + config.sim.partition(":")[2].replace("/", "-"))
@@ -179,13 +175,12 @@ def _result(experiment: TransferExperiment, folder: Path, seeds: Mapping[int, Ma
     def successes(place: str) -> Successes:
         return _by_arm({seed: one[place] for seed, one in seeds.items()})
 
-    dialled = {gap: successes(f"dial {gap}") for gap in DIAL}
     dial: dict[str, dict[float, torch.Tensor]] = {}
-    for gap, arms in dialled.items():
-        for arm, by_seed in arms.items():
+    for gap in DIAL:
+        for arm, by_seed in successes(f"dial {gap}").items():
             dial.setdefault(arm, {})[gap] = torch.cat(list(by_seed.values()))
-    places = ("the simulator", "the model")
-    inside = {place: successes(place) for place in places if any(one.get(place) for one in seeds.values())}
+    places = [one for one in ("the simulator", "the model") if any(kept.get(one) for kept in seeds.values())]
+    inside = {place: successes(place) for place in places}
     cameras = {seed: one["camera"][experiment.look_hash] for seed, one in seeds.items() if experiment.look}
     camera = _by_arm({seed: one["arms"] for seed, one in cameras.items()})
     named = next(iter(cameras.values()))["errors"] if cameras else ()

@@ -63,9 +63,8 @@ class _SeedRun:
             self.results |= json.loads(self.file.read_text(encoding="utf-8"))
 
     def run(self) -> dict[str, Any]:
-        experiment = self.experiment
+        experiment, counts = self.experiment, self.experiment.real_episodes
         self._train("first", self.sim, None)
-        counts = experiment.real_episodes
         few = IDENTIFIED_FROM if IDENTIFIED_FROM in counts else max(counts)
         models = {f"model {count}": count for count in counts} if "model" in experiment.arms else {}
         first = self.folder / "first"
@@ -85,9 +84,8 @@ class _SeedRun:
             if arm not in self.results["real"]:
                 self._train(arm, *world())
                 self._test(arm)
-        for arm in FLOORS:
-            if arm not in self.results["real"]:
-                self._test(arm)
+        for arm in [one for one in FLOORS if one not in self.results["real"]]:
+            self._test(arm)
         if models:
             self._test_in_model(self.results.setdefault("judged in the model of", few))
         if experiment.look:

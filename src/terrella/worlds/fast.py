@@ -69,8 +69,7 @@ def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     wins = quick < slow
     if wins:
         vars(generator)["forward"] = _either(eager, other)
-    way = EAGER if not wins else ONNX if on_cpu else COMPILED
-    choice = Choice(way, slow, quick, prepared)
+    choice = Choice(EAGER if not wins else ONNX if on_cpu else COMPILED, slow, quick, prepared)
     return world.replaced(generator=generator, card={"fast": str(choice)}), choice
 
 

@@ -63,7 +63,9 @@ def save_world(
     weights = {
         f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()
     }
-    parts = {name: {"kind": part.kind, "config": _plain(part.config)} for name, part in world.parts.items()}
+    parts = {
+        name: {"kind": part.kind, "config": part.config and asdict(part.config)} for name, part in world.parts.items()
+    }
     about = _described(KIND, VERSION, world.about, parts) | ({} if card is None else {"card": dict(card)})
     try:
         if remembered is None:
@@ -183,9 +185,8 @@ def open_world(
     if memory_mb is not None:
         what = "latent world" if kind == LATENT else "world of Gaussians"
         raise CheckpointError(f"{path} is a {what}, which keeps no pictures of an episode; leave `memory_mb` out.")
-    if kind == splat_folder.KIND:
-        return splat_folder.load_splat(path, about)  # always on the CPU
-    return load_latent(path, device)
+    # Gaussians are always on the CPU
+    return splat_folder.load_splat(path, about) if kind == splat_folder.KIND else load_latent(path, device)
 
 
 def _about(world: dict) -> About:
@@ -237,10 +238,6 @@ def _settings(config: type, settings: dict) -> Any:
 
 def _tuple(value: Any) -> Any:
     return tuple(map(_tuple, value)) if isinstance(value, list) else value
-
-
-def _plain(config: Any) -> dict | None:
-    return None if config is None else asdict(config)
 
 
 def _network(kind: type) -> Make:

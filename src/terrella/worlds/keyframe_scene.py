@@ -64,8 +64,7 @@ class KeyframeScene:
     @cached_property
     def _table(self) -> torch.Tensor:
         """Recorded keyframes in the channel `places`."""
-        kinds = torch.full((len(self.recorded),), RECORDED, device=self.device)
-        return keyframe_table(self.recorded.pose, kinds)
+        return keyframe_table(self.recorded.pose, torch.full((len(self.recorded),), RECORDED, device=self.device))
 
     @cached_property
     def _small(self) -> torch.Tensor:

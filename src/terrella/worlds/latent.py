@@ -193,9 +193,7 @@ class LatentWorld:
             return state["window"][:, -1]
         if name == "rgb":
             return self.network.decode(state["window"][:, -1])
-        if name == "uncertainty":
-            return self.network.expected(state["spread"])
-        return state[name]
+        return self.network.expected(state["spread"]) if name == "uncertainty" else state[name]
 
 
 def _lone(name: str, width: int) -> bool:

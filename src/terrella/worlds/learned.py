@@ -111,9 +111,8 @@ class LearnedWorld:
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
         settings.pop("moves", None)  # those of a codec, found in its recording
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
-        settings |= (
-            {} if not self.body else {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
-        )
+        if self.body:
+            settings |= {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
         settings |= {"vitals": self.outcome.begins, "actions": self.controls.numbers}
         return VideoConfig(**settings, geometry=posed, objects=bool(self.objects))
 
@@ -265,10 +264,8 @@ class LearnedWorld:
             return prior.replace(**known)
         batch, device = evidence.batch, self.device
         known |= self.objects.observe(prior, evidence, observation, self.scene.camera)
-        known |= {
-            "gone": torch.zeros(batch, len(GONE), device=device),
-            "uncertainty": torch.zeros(batch, device=device),
-        }
+        known["gone"] = torch.zeros(batch, len(GONE), device=device)
+        known["uncertainty"] = torch.zeros(batch, device=device)
         if "actions" in evidence.seen:
             known["actions"] = evidence.seen["actions"]
         elif prior is None:
@@ -284,8 +281,7 @@ class LearnedWorld:
     def _draw(self, after: State, before: State, seeds: torch.Tensor, still: torch.Tensor) -> State:
         """`after` with its frame, which is drawn when it is first read; entries that are `still` [B] keep that of `before`."""
         now = {name: after[name] for name in after if name not in self._drawn_names}
-        frame = Step(self._frame, before, {**now, "seeds": seeds, "still": still})
-        drawn = Deferred(self._drawn_names, frame)
+        drawn = Deferred(self._drawn_names, Step(self._frame, before, {**now, "seeds": seeds, "still": still}))
         if drawn.length > PATIENCE:
             drawn.values()
         return State(now, after.arenas, drawn)

@@ -247,9 +247,8 @@ class Billboards(nn.Module):
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
         # seen in part or unlike any look: as before, else the nearest look
         look, place = torch.where(look == NONE, guess, look), listed[..., 1:]
-        now = torch.where(
-            known[..., None], update_billboards(old, place, look.float()), new_billboards(number, place, look)
-        )
+        moved = update_billboards(old, place, look.float())
+        now = torch.where(known[..., None], moved, new_billboards(number, place, look))
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
         lit = (look != NONE) & (~known | whole)
         now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)

@@ -248,8 +248,7 @@ def world_of(
     low, middle, high = torch.quantile(some, torch.tensor([0.05, 0.5, 0.95]), dim=0)
     rng = torch.Generator().manual_seed(0)
     high[2] += config.body.eye_m  # the eye may be above all Gaussians
-    wide = low + (high - low) * torch.rand(400, 3, generator=rng)
-    places = torch.cat([middle[None], wide])
+    places = torch.cat([middle[None], low + (high - low) * torch.rand(400, 3, generator=rng)])
     level = world.occupancy.surface(places, config.body)
     grounded = torch.cat([places[:, :2], (level + config.body.eye_m)[:, None]], 1)
     stands = level.isfinite() & ~world.collider.blocked(grounded.nan_to_num(), config.body)

@@ -146,7 +146,6 @@ def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     edges = F.pad(drawn.diff(dim=3).abs().mean(1, keepdim=True), (0, 1))
     own = ((drawn - merged).abs() * glimpse.known[:, None]).mean(1, keepdim=True)
     maps = [drawn, merged, own, glimpse.known[:, None], trust, last[:, 3:4], apart, clean[:, 3:4], edges]
-    whole = torch.cat(maps, 1)
-    soft = F.avg_pool2d(whole, CELLS)
+    soft = F.avg_pool2d(torch.cat(maps, 1), CELLS)
     here = soft[:, :3] - F.avg_pool2d(F.pad(soft[:, :3], (1, 1, 1, 1), mode="replicate"), 3, 1)
     return torch.cat([soft, here.abs().mean(1, keepdim=True)], 1)

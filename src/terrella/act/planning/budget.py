@@ -28,8 +28,7 @@ def search_config_within(
         step_ms = _step_ms(world, cost, state, config.samples)
         moves = int(budget_ms / (step_ms * block))
         if moves >= _MIN_MOVES or config.samples // 2 < _MIN_SAMPLES:
-            fits = moves >= _MIN_MOVES
-            return replace(config, horizon=min(max(moves, _MIN_MOVES), _MAX_MOVES)), fits
+            return replace(config, horizon=min(max(moves, _MIN_MOVES), _MAX_MOVES)), moves >= _MIN_MOVES
         config = replace(config, samples=config.samples // 2)
 
 

@@ -48,5 +48,4 @@ def imagined_futures(
             pictures += [world.render(state, (channel,))[channel].cpu()] * times.count(step)
         yield None
     assert total is not None
-    shown = torch.stack(pictures, 1)
-    yield [ImaginedFuture(float(price), frames) for price, frames in zip(total[0], shown)]
+    yield [ImaginedFuture(float(price), frames) for price, frames in zip(total[0], torch.stack(pictures, 1))]

@@ -155,8 +155,7 @@ class Planner:
 
     def _plan(self, state: State, episodes: list[PlannerMemory]) -> list[PlannerMemory]:
         began, config = time.perf_counter(), self.config
-        names = episodes[0].goal
-        goal = {name: torch.cat([episode.goal[name] for episode in episodes]) for name in names}
+        goal = {name: torch.cat([episode.goal[name] for episode in episodes]) for name in episodes[0].goal}
         seeds = [later(episode.seed, 4 * episode.step + _SEARCH) for episode in episodes]
         problem = PlanningProblem(
             self.world,
