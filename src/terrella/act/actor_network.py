@@ -101,9 +101,8 @@ class ActorConfig:
     def _action_text(self) -> str:
         if self.mode == CHOICE:
             return " and ".join(f"one of {count}" for count in self.counts)
-        return f"{len(self.low)} {self.mode}" + (
-            f" from {list(self.low)} to {list(self.high)}" if self.mode == AXES else ""
-        )
+        limits = f" from {list(self.low)} to {list(self.high)}" if self.mode == AXES else ""
+        return f"{len(self.low)} {self.mode}{limits}"
 
 
 def _actions(spec: Spec) -> tuple[str, tuple[int, ...], tuple[float, ...], tuple[float, ...]]:

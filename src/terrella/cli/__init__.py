@@ -211,6 +211,5 @@ def _of_a_renderer(error: Exception) -> bool:
     if type(error).__module__ == "mujoco" and any(word in str(error) for word in ("OpenGL", "gladLoadGL", "EGL")):
         return True
     frames = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return any(
-        f"{name}.".startswith(f"{renderer}.") for name in (type(error).__module__, *frames) for renderer in _RENDERERS
-    )
+    starts = tuple(f"{renderer}." for renderer in _RENDERERS)
+    return any(f"{name}.".startswith(starts) for name in (type(error).__module__, *frames))

@@ -43,9 +43,8 @@ class EnergyMeter:
     def joules(self) -> float:
         if not self.files:
             return WATTS_OF_A_CORE * (time.process_time() - self._busy)
-        most = [
-            int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files
-        ]  # then it wraps around
+        # the value at which each counter wraps around
+        most = [int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files]
         return sum((now - then) % wrap for now, then, wrap in zip(self._readings(), self._first, most)) / 1e6
 
     def _readings(self) -> list[int]:

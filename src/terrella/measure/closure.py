@@ -151,9 +151,8 @@ def _units(exam: Exam) -> list[Unit]:
             steps = len(way.steps(some, poses_at(some, 0) if some[0].pose is not None else None))
             calls = {(arm, "observe"): len(some) * some[0].context, (arm, verb): len(some) * (steps + steps // 2)}
             run = partial(_run, exam, world, some, way, first)
-            units.append(
-                Unit(f"memory|{arm}|{place}|{which}|{number}", f"{arm}, {place_label(place)}: {way.name}", calls, run)
-            )
+            words = f"{arm}, {place_label(place)}: {way.name}"
+            units.append(Unit(f"memory|{arm}|{place}|{which}|{number}", words, calls, run))
     return units
 
 

@@ -211,9 +211,8 @@ def _dreams(exam: Exam, names: tuple[str, ...], world: World, clips: Sequence[Cl
     order = torch.randperm(len(clips), generator=exam.rng(1)).tolist()
     turn = {pick: order[(at + 1) % len(order)] for at, pick in enumerate(order)}
     units, verb = [], "pose" if motion == TRUE else "imagine"
-    words = (
-        f"{arm}, {place_label(place)}, {motion + ' motion' if motion in (PREDICTED, TRUE) else motion}, {steps} steps"
-    )
+    under = motion + " motion" if motion in (PREDICTED, TRUE) else motion
+    words = f"{arm}, {place_label(place)}, {under}, {steps} steps"
     for number, (first, some) in enumerate(batches(exam, world, clips)):
         watches = [watch for probe in probes for watch in probe.watch(exam, world, of, first)]
         others = [clips[turn[first + at]] for at in range(len(some))]

@@ -70,9 +70,8 @@ def outcome_rows(
         tail = place, arm, PREDICTED, step
         if "reward" in dreamt:
             usual = float((truth["reward"][going]).median())
-            true, mine = (
-                (reward * live).sum(1) for reward in (truth["reward"][:, part], dreamt["reward"][:, :step].double())
-            )
+            true = (truth["reward"][:, part] * live).sum(1)
+            mine = (dreamt["reward"][:, :step].double() * live).sum(1)
             plain = usual * live.double().sum(1)
             baselines = {USUAL: mean_interval((plain - true).abs(), rng())}
             error, gain = (mine - true).abs(), mean_interval((plain - true).abs() - (mine - true).abs(), rng())

@@ -34,9 +34,8 @@ def _verdict(card: Scorecard) -> str:
         unit = f", {kind[2]}" if kind[2] else ""
         about = f"{escape(f'{kind[0]} {kind[1]}{unit}')}<small>{escape(place_label(kind[3]))}</small>"
         lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
-    inside = (
-        table_of(["gain over copying the last frame", *(steps_words(step) for step in steps)], lines) if lines else ""
-    )
+    heads = ["gain over copying the last frame", *(steps_words(step) for step in steps)]
+    inside = table_of(heads, lines) if lines else ""
     return f"<section><h2>{escape(verdict(card)[0])}</h2>{inside}</section>"
 
 

@@ -175,9 +175,8 @@ def _rows(exam: Exam, where, dreamt: Results, truth: Results) -> list[Row]:
         baselines = {COPY_LAST: ratio_interval(truth[f"{name}/first"].flatten(), real[:, step - 1], exam.rng())}
         sharp = ratio_interval(mine[:, step - 1], real[:, step - 1], exam.rng())
         rows.append(Row(probe, name, "sharpness", "\u00d7", place, arm, motion, step, sharp, 0, baselines))
-        mine_change, change = (
-            some[f"{name}/change"][:, max(0, step - _CHANGE_STEPS) : step].sum(1) for some in (dreamt, truth)
-        )
+        late = slice(max(0, step - _CHANGE_STEPS), step)
+        mine_change, change = (some[f"{name}/change"][:, late].sum(1) for some in (dreamt, truth))
         if change.any():
             figure = ratio_interval(mine_change, change, exam.rng())
             baselines = {COPY_LAST: Figure(0.0, 0.0, 0.0, len(change))}

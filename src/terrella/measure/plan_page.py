@@ -96,13 +96,11 @@ def plan_page(
 ) -> str:
     """HTML: the verdict, a table with a row for each arm, success against compute, dream beside reality, and the settings."""
     heads = list(dict.fromkeys(name for row in arms.values() for name in row))
-    rows = [
-        [escape(arm), *(figure_text(row[name]) if name in row else "" for name in heads)] for arm, row in arms.items()
-    ]
+    cells = {arm: [figure_text(row[name]) if name in row else "" for name in heads] for arm, row in arms.items()}
+    rows = [[escape(arm), *figures] for arm, figures in cells.items()]
     words = "".join(f"<p>{escape(line)}</p>" for line in lead[1:])
-    shown = (
-        f'<video controls loop muted playsinline width="100%" src="{escape(film_name)}"></video>' if film_name else ""
-    )
+    video = f'<video controls loop muted playsinline width="100%" src="{escape(film_name)}"></video>'
+    shown = video if film_name else ""
     if picture is not None:
         data = base64.b64encode(jpeg(picture)).decode()
         shown += f'<div class=scroll><img alt="reality and dream" src="data:image/jpeg;base64,{data}"></div>'

@@ -212,20 +212,17 @@ def _correlations(agreed: Agreement) -> str:
 
 def _figures(arm: str, agreed: Agreement, evaluation: PolicyEvaluation) -> str:
     unit = "of all episodes" if evaluation.what == SUCCESS else "of the range of the real scores"
-    mmrv = f"MMRV {with_interval(agreed.mmrv)} {unit}"
-    return (
-        f"{arm} and reality: Pearson {with_interval(agreed.pearson)}, Spearman {with_interval(agreed.spearman)}, {mmrv}"
-    )
+    pearson, spearman, mmrv = map(with_interval, (agreed.pearson, agreed.spearman, agreed.mmrv))
+    return f"{arm} and reality: Pearson {pearson}, Spearman {spearman}, MMRV {mmrv} {unit}"
 
 
 def _control(evaluation: PolicyEvaluation) -> str:
     agreed = evaluation.control
     assert agreed is not None
+    control = "control (the dream is given the actions of another episode)"
     if not math.isfinite(agreed.spearman.value):
-        return (
-            f"control (the dream is given the actions of another episode): all policies have the same {evaluation.what}"
-        )
-    text = f"control (the dream is given the actions of another episode): {_correlations(agreed)}"
+        return f"{control}: all policies have the same {evaluation.what}"
+    text = f"{control}: {_correlations(agreed)}"
     return f"{text}: the ranking hardly depends on the right actions" if _control_as_good(evaluation) else text
 
 

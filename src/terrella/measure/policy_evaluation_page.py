@@ -52,10 +52,8 @@ def _scatter(evaluation: PolicyEvaluation) -> str:
         return ""
     boxes = ""
     for arm, title in ((DREAM, "The dream"), (CONTROL, "The control: the dream is given other actions")):
-        rows = {name: evaluation.rows[name] for name in evaluation.policies}
-        points = [
-            ScatterPoint(name, row[REAL], row[arm], _DREAM if arm == DREAM else QUIET) for name, row in rows.items()
-        ]
+        rows, colour = {name: evaluation.rows[name] for name in evaluation.policies}, _DREAM if arm == DREAM else QUIET
+        points = [ScatterPoint(name, row[REAL], row[arm], colour) for name, row in rows.items()]
         svg = scatter(points, f"{evaluation.what} in reality", f"{evaluation.what} in the dream")
         boxes += f"<figure><h3>{escape(title)}</h3>{svg}</figure>"
     return f"<div class=charts>{boxes}</div>"
@@ -81,17 +79,14 @@ def _errors(evaluation: PolicyEvaluation) -> str:
         if channel.endswith(PERSISTENCE) or len(band.value) < 2:
             continue
         held = evaluation.curves.get(channel + PERSISTENCE)
-        lines = [_line("the dream", band, _DREAM)] + (
-            [_line("first observation, held", held, QUIET, "2 3")] if held else []
-        )
+        lines = [_line("the dream", band, _DREAM)]
+        lines += [_line("first observation, held", held, QUIET, "2 3")] if held else []
         span = y_span([0.0, *(v for line in lines for v in (*line.y, *line.low, *line.high))])
-        last = len(band.value) - 1
-        ticks = [(float(2**k), str(2**k)) for k in range(12) if 2**k <= last]
-        is_uncertainty = channel == UNCERTAINTY
-        title = "Uncertainty of the dream" if is_uncertainty else f"Error in {channel}"
-        svg = line_chart(
-            lines, ticks, "steps", "expected error" if is_uncertainty else "distance to reality", True, span
-        )
+        ticks = [(float(2**k), str(2**k)) for k in range(12) if 2**k < len(band.value)]
+        title, y_label = f"Error in {channel}", "distance to reality"
+        if channel == UNCERTAINTY:
+            title, y_label = "Uncertainty of the dream", "expected error"
+        svg = line_chart(lines, ticks, "steps", y_label, True, span)
         boxes += f"<figure><h3>{escape(title)}</h3>{svg}{legend(lines)}</figure>"
     return f"<div class=charts>{boxes}</div>" if boxes else ""
 

@@ -31,9 +31,10 @@ def series(
         truth = torch.stack([rows_at(clips, name, context + step) for step in range(given.shape[1])], 1).double()
         last = rows_at(clips, name, context - 1).double()[:, None]
         far = [(some[..., :3] - truth[..., :3]).norm(dim=-1) for some in (given, last)]
-        turned = [
-            2 * torch.arccos((some[..., 3:] * truth[..., 3:]).sum(-1).abs().clamp(max=1)) for some in (given, last)
-        ]
+        cosines = [
+            (some[..., 3:] * truth[..., 3:]).sum(-1).abs().clamp(max=1) for some in (given, last)
+        ]  # of half the angle
+        turned = [2 * torch.arccos(cosine) for cosine in cosines]
         made += [Series(name, "distance", "m", -1, *far), Series(name, "turn", "rad", -1, *turned)]
     return made
 
@@ -53,9 +54,8 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
             for step in exam.config.horizons if made.unit == "m" else ():
                 went = walked[:, step - 1] > WALKED_M
                 if went.any():
-                    shares = [
-                        100 * some[went, step - 1] / walked[went, step - 1] for some in (made.values, made.copied)
-                    ]
+                    way = walked[went, step - 1]
+                    shares = [100 * some[went, step - 1] / way for some in (made.values, made.copied)]
                     for what, figure in (("mean", mean_interval), ("median", median_interval)):
                         where = "pose", made.channel, f"distance over the way gone, {what}", "%", place, arm
                         mine, copied = (figure(share, exam.rng()) for share in shares)

@@ -82,9 +82,8 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     if of == ENDINGS:
         return []
     names = vectors(exam, world)
-    return (
-        [StepMetric(tuple(names), lambda seen, *_: {f"{name}/vector": seen[name] for name in names})] if names else []
-    )
+    metric = StepMetric(tuple(names), lambda seen, *_: {f"{name}/vector": seen[name] for name in names})
+    return [metric] if names else []
 
 
 def _report(exam: Exam, results: ExamResults) -> ProbeReport:

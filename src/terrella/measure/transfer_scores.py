@@ -83,9 +83,8 @@ def verdict(scores: TransferScores) -> list[str]:
             lines.append(f"{arm} recovers {part:.0%} of the gap between nominal and oracle")
     for name, agreed in scores.agreed.items():
         pearson, mmrv = with_interval(agreed.pearson), with_interval(agreed.mmrv)
-        lines.append(
-            f"{name} and the real environment on {agreed.pearson.count} policies: Pearson {pearson}, MMRV {mmrv}"
-        )
+        both = f"{name} and the real environment on {agreed.pearson.count} policies"
+        lines.append(f"{both}: Pearson {pearson}, MMRV {mmrv}")
     if scores.camera:
         winner = max((arm for arm in scores.camera if ORACLE not in arm), key=lambda arm: scores.camera[arm].value)
         nominal = f"with the goal read from a camera, nominal succeeds in {percent(scores.camera[NOMINAL])}"

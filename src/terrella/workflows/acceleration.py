@@ -89,9 +89,8 @@ class AccelerationResult:
         step = f"{1e3 * self.control_step_s:g} ms"
         lines.append(f"a new random action every {step}; {self.threads} threads; joules {self.energy}")
         if self.beside is not None:
-            lines.insert(
-                0, f"{self.world} imagines {self.ratio:.2f} times as fast as {self.beside} steps, each at its best.\n"
-            )
+            verdict = f"{self.world} imagines {self.ratio:.2f} times as fast as {self.beside} steps, each at its best."
+            lines.insert(0, f"{verdict}\n")
             horizon = f"{self.usable_horizon} steps, beyond which standing still predicts as well"
             lines.append(f"usable horizon: {horizon if self.usable_horizon else UNMEASURED}")
         missing = "not measured; give --agent, --reference and --beside"

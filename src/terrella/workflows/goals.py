@@ -45,9 +45,8 @@ def with_estimated_pose(goal: Observation, world: World) -> Observation:
 
 def state_channel(spec: Spec) -> str:
     """The channel that holds the state as a vector: `observation`, or the first vector. PlanningError where there is none."""
-    vectors = [
-        name for name, space in spec.channels.items() if len(space.shape or ()) == 1 and kind_of(name) not in _NO_STATE
-    ]
+    plain = {name: space for name, space in spec.channels.items() if kind_of(name) not in _NO_STATE}
+    vectors = [name for name, space in plain.items() if len(space.shape or ()) == 1]
     if not vectors:
         raise PlanningError(f"{spec.name} has no state of numbers; its channels are {', '.join(spec.channels)}.")
     return "observation" if "observation" in vectors else vectors[0]

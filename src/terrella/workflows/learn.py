@@ -146,9 +146,8 @@ class _Learning:
 
     def _record(self, report: Report) -> dict[str, object]:
         schedule, name, environment = self.schedule, self.name, self.config.environment
-        opened = schedule.facts.setdefault(
-            "opened", name if schedule.has_recording else held_to_real_time(name, environment)
-        )
+        first = name if schedule.has_recording else held_to_real_time(name, environment)
+        opened = schedule.facts.setdefault("opened", first)
         most = SMALL if schedule.seconds < 60 * SHORT_MIN else MOST
         world = self.config.controls.of(open_small(opened, environment, most))
         self._announce()  # after it was opened: nothing is announced of an environment that does not open

@@ -105,9 +105,8 @@ def _lines(
     if (study.goal or study.places) and planner.get("success") and not planner["success"].value:
         lines.append(_never_reached(study, episodes))
     measure = "success" if "success" in planner else "return"
-    lines += [
-        f"{point.imagined:>10,.0f} imagined steps, {point.label}: {measure} {point.score}" for point in played.curve
-    ]
+    curve = played.curve
+    lines += [f"{one.imagined:>10,.0f} imagined steps, {one.label}: {measure} {one.score}" for one in curve]
     if len(played.curve) > 1:
         lines.append(conclusion(played.curve, measure, study.config.seed))
     if study.search.budget_ms is not None:

@@ -196,9 +196,8 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
     real = world if config.real in (None, name) else open_real(config.real, config.environment, world.spec)
     check_alike(world.spec, real.spec)
     if config.success and config.success not in real.spec.channels:
-        raise PlanningError(
-            f"{real.spec.name} has no channel '{config.success}'; it has {', '.join(real.spec.channels)}."
-        )
+        known = ", ".join(real.spec.channels)
+        raise PlanningError(f"{real.spec.name} has no channel '{config.success}'; it has {known}.")
     goal = {} if is_recording(config.goal) else read_goal(config.goal, world.spec)
     views = None if config.success else views_of(config.goal, goal, world, real.spec)
     limit = steps or real.spec.max_episode_steps

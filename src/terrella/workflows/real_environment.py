@@ -88,11 +88,6 @@ def meaning_difference(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> st
 
 def comparable_channels(world: Spec, real: Spec) -> tuple[str, ...]:
     """The channels in which imagination and reality can be compared: pictures and vectors that both render."""
-    both = {
-        name: space
-        for name, space in real.channels.items()
-        if name in world.channels and space.shape == world.channels[name].shape
-    }
-    return tuple(
-        name for name, space in both.items() if kind_of(name) not in _NOT_COMPARED and len(space.shape or ()) in (1, 3)
-    )
+    both = [name for name in real.channels if name in world.channels and kind_of(name) not in _NOT_COMPARED]
+    shapes = {name: (real.channels[name].shape, world.channels[name].shape) for name in both}
+    return tuple(name for name, (mine, other) in shapes.items() if mine == other and len(mine or ()) in (1, 3))

@@ -54,10 +54,9 @@ class TrainPolicyResult:
 
     def to_json(self) -> dict[str, Any]:
         if self.trial is None:
-            hint = (
-                f"terrella train policy --in {self.world} --out {Path(self.facts['policy']).parent} --real ENVIRONMENT"
-            )
-            return jsonable({**self.facts, "play": f"{hint} tries it there"})
+            out = Path(self.facts["policy"]).parent
+            hint = f"terrella train policy --in {self.world} --out {out} --real ENVIRONMENT tries it there"
+            return jsonable({**self.facts, "play": hint})
         return jsonable({**self.trial.to_json(), **self.facts})
 
     def summary(self) -> str:
@@ -119,9 +118,8 @@ def train_policy(world: str | Path, config: TrainPolicyConfig, *, progress: Prog
         facts = recipe.train_policy(inside, world, out, config.practice, report, config.recording, growing=growing)
     if outside is None:
         return TrainPolicyResult(world, facts, None)
-    return TrainPolicyResult(
-        world, facts, try_policy(out, inside, outside, config.episodes, config.practice.seed, progress)
-    )
+    trial = try_policy(out, inside, outside, config.episodes, config.practice.seed, progress)
+    return TrainPolicyResult(world, facts, trial)
 
 
 def try_policy(

@@ -184,9 +184,8 @@ def agreement(world: World, held: Trials, seed: int) -> Figure:
     tried = world.spec.sample_action(len(each), rng)
     after = world.render(world.imagine(state, tried, rng), ("qpos", "qvel"))
     unit = {name: getattr(held, name)[:, :-1][held.valid].std(0).clamp_min(1e-6) for name in ("qpos", "qvel")}
-    away = sum(
-        ((after[name] - getattr(held, name)[episode, at + 1][each]) / unit[name]).square().mean(1) for name in unit
-    )
+    true = {name: getattr(held, name)[episode, at + 1][each] for name in unit}
+    away = sum(((after[name] - true[name]) / unit[name]).square().mean(1) for name in unit)
     best = torch.as_tensor(away).view(-1, CANDIDATES).argmin(1) + CANDIDATES * torch.arange(len(at))
     return _apart(world, tried[best], held.actions[episode, at], seed)
 

@@ -30,10 +30,9 @@ class Motion(nn.Module):
         self.config = config
         acts = config.actions * (config.history + 1)
         self.turn = nn.Sequential(nn.Linear(acts, 128), nn.ReLU(), nn.Linear(128, 128), nn.ReLU(), nn.Linear(128, 1))
-        self.glide = nn.Linear(2 + config.actions, 2)
-        self.ending = nn.Sequential(
-            nn.Linear(2 + config.actions, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
-        )
+        inputs = 2 + config.actions
+        self.glide = nn.Linear(inputs, 2)
+        self.ending = nn.Sequential(nn.Linear(inputs, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1))
         self.register_buffer("middle", torch.zeros(2))
         self.register_buffer("span", torch.ones(()))
 

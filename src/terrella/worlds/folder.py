@@ -60,12 +60,10 @@ def save_world(
 
     CheckpointError where it cannot be written, for example on a full disk: the old world stays.
     """
-    weights = {
-        f"{name}.{key}": value for name, part in world.parts.items() for key, value in _weights(name, part).items()
-    }
-    parts = {
-        name: {"kind": part.kind, "config": part.config and asdict(part.config)} for name, part in world.parts.items()
-    }
+    weights, parts = {}, {}
+    for name, part in world.parts.items():
+        weights |= {f"{name}.{key}": value for key, value in _weights(name, part).items()}
+        parts[name] = {"kind": part.kind, "config": part.config and asdict(part.config)}
     about = _described(KIND, VERSION, world.about, parts) | ({} if card is None else {"card": dict(card)})
     try:
         if remembered is None:
@@ -305,9 +303,8 @@ def _below(tensors: Tensors, name: str) -> dict[str, torch.Tensor]:
 
 
 def _pack(keys: Keyframes, quality: int) -> dict[str, torch.Tensor]:
-    depths = [
-        zlib.compress((d * 1000).round().clamp(0, 65535).cpu().numpy().astype("<u2").tobytes(), 9) for d in keys.depth
-    ]
+    millimetres = ((depth * 1000).round().clamp(0, 65535).cpu().numpy().astype("<u2") for depth in keys.depth)
+    depths = [zlib.compress(picture.tobytes(), 9) for picture in millimetres]
     about = {"pose": keys.pose, "depth_size": torch.tensor(keys.depth.shape[-2:])}
     return {**about, **_pack_frames(keys.rgb, quality), **_pack_parts("depth", depths)}
 

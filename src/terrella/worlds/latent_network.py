@@ -245,6 +245,5 @@ class LatentNetwork(nn.Module):
 
 
 def _perceptron(into: int, hidden: int, out: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(into, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
-    )
+    first, second = (nn.Linear(into, hidden), nn.SiLU()), (nn.Linear(hidden, hidden), nn.SiLU())
+    return nn.Sequential(*first, *second, nn.Linear(hidden, out))

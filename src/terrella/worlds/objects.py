@@ -147,9 +147,8 @@ class Billboards(nn.Module):
     def paint(self, state: State, frame: DrawnFrame, camera: Intrinsics | None) -> DrawnFrame:
         """The frame with the state's billboards in it."""
         assert camera is not None and frame.depth is not None and frame.things is not None
-        rgb, depth, instances = self.painted(
-            state["billboards"], frame.rgb.float() / 255, frame.depth, state["pose"], camera
-        )
+        rgb = frame.rgb.float() / 255
+        rgb, depth, instances = self.painted(state["billboards"], rgb, frame.depth, state["pose"], camera)
         things = torch.maximum(frame.things, (instances > 0).float())
         return DrawnFrame((rgb * 255).round().to(torch.uint8), depth, things, instances)
 
@@ -194,9 +193,8 @@ class Billboards(nn.Module):
             for part, stream in ((likely, LOOKS), (logits.move.softmax(1), MOVES))
         ]
         gone = chance.uniform(seeds, (rows,), stream=GOES) < logits.gone.sigmoid().unflatten(0, (-1, rows))
-        after = update_billboards(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float()).unflatten(
-            0, (-1, rows)
-        )
+        after = update_billboards(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float())
+        after = after.unflatten(0, (-1, rows))
         after = torch.where(gone[..., None], 0.0, after)
         return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
 
@@ -247,8 +245,8 @@ class Billboards(nn.Module):
         guess = torch.where((was != NONE) | off.isinf().all(-1), was, off.argmin(-1))
         # seen in part or unlike any look: as before, else the nearest look
         look, place = torch.where(look == NONE, guess, look), listed[..., 1:]
-        moved = update_billboards(old, place, look.float())
-        now = torch.where(known[..., None], moved, new_billboards(number, place, look))
+        again = update_billboards(old, place, look.float())
+        now = torch.where(known[..., None], again, new_billboards(number, place, look))
         light = (bright / usual[look.clamp_min(0)]).clamp(0.25, 4)
         lit = (look != NONE) & (~known | whole)
         now = torch.cat([now[..., :LIGHT], torch.where(lit, light, now[..., LIGHT])[..., None]], -1)

@@ -182,9 +182,8 @@ class Planner:
         fresh = self.moves.initial(1, self.config.horizon, self.config.spread)[0]
         considered = self.moves.actions(torch.cat([plan[None], plans.considered[entry, 1:]]))
         state = problem.state.at(entry)
-        decision = Decision(
-            float(plans.cost[entry]), problem.imagined_steps, ms, trusted, considered, state, episode.goal
-        )
+        cost, steps = float(plans.cost[entry]), problem.imagined_steps
+        decision = Decision(cost, steps, ms, trusted, considered, state, episode.goal)
         return replace(
             episode,
             queue=plan[:done].repeat_interleave(self.config.block, 0),

@@ -131,9 +131,8 @@ def _search_by_sampling(problem: PlanningProblem, config: SearchConfig, start: W
         noise = coloured(seeds, count, problem.horizon, moves.size, config.colour if icem else _WHITE, number)
         kept = [elites[:, : max(1, int(config.keep * config.elite_count))], moves.mode(belief)[:, None]]
         given = start.plans() if not number else kept if icem else []
-        codes = torch.cat([*given, moves.sample(belief, noise)], 1)[
-            :, : max(count, sum(each.shape[1] for each in given))
-        ]
+        most = max(count, sum(each.shape[1] for each in given))
+        codes = torch.cat([*given, moves.sample(belief, noise)], 1)[:, :most]
         costs = problem.evaluate(codes)
         check_finite_costs(costs, problem)
         order = costs.argsort(dim=1, stable=True)
@@ -223,19 +222,16 @@ def _search_tree(problem: PlanningProblem, config: SearchConfig, start: WarmStar
         paths = _picked(tried, order)
         repeated = paths[:, 0, -1:].expand(-1, problem.horizon - depth - 1, -1)
         plan = torch.cat([paths[:, 0], repeated], 1)  # the last move fills the horizon
-        result = _Best(
-            *(result if depth else _Best(plan, total[:, 0])).where(problem.trusted_moves > depth, plan, total[:, 0])
-        )
+        result = result if depth else _Best(plan, total[:, 0])
+        result = _Best(*result.where(problem.trusted_moves > depth, plan, total[:, 0]))
         if not bool((problem.trusted_moves > depth + 1).any()):
             break
     if start.plan is not None:  # the previous plan stays unless a better one was found
         before = _Best(start.plan, problem.evaluate(start.plan[:, None], fixed_horizon=True)[:, 0])
         before.update(result.codes, result.costs)
         result = before
-    whole = paths.shape[2] == problem.horizon
-    return SearchResult(
-        result.codes, result.costs, _initial(problem, config), _some(paths) if whole else result.codes[:, None]
-    )
+    considered = _some(paths) if paths.shape[2] == problem.horizon else result.codes[:, None]
+    return SearchResult(result.codes, result.costs, _initial(problem, config), considered)
 
 
 def _order(state: State, costs: torch.Tensor, tie: torch.Tensor, width: int) -> torch.Tensor:
