@@ -13,10 +13,8 @@ _UNLIMITED = 1e6  # a limit beyond this counts as no limit
 
 
 def axes_of(spec: Spec) -> list[dict]:
-    """Name, unit, low, high, neutral and whole (whole numbers only) of each axis, for the page's sliders.
-
-    Only a Box has axes. An axis without limits has the range of its keys, or -1 to 1.
-    """
+    """Name, unit, low, high, neutral and whole (whole numbers only) of each axis of a Box, for the page's sliders. An axis without
+    limits has the range of its keys, or -1 to 1."""
     space = spec.action
     if not isinstance(space, spaces.Box):
         return []
@@ -39,13 +37,11 @@ def axes_of(spec: Spec) -> list[dict]:
 
 
 def action_of(spec: Spec, held: Sequence[str] = (), axes: Sequence[float] = ()) -> torch.Tensor:
-    """The action [1, *spec.action.shape] of the keys held, oldest first, and of the values of the axes, in their units.
+    """The action [1, *spec.action.shape] of the keys held, oldest first, and of the values of the axes, in their units, clipped.
 
-    Buttons (MultiBinary) combine by element-wise maximum. A choice (Discrete, or each of a MultiDiscrete) is set by the key that
-    was pressed last and has a value for it. An axis (Box) has the value given, or that of the held key which is furthest from
-    neutral, so that a zero does not override a negative direction. Without input it is the neutral action. Unknown keys are
-    ignored, and values are clipped to the limits.
-    """
+    Buttons (MultiBinary) combine by element-wise maximum. A choice (Discrete, or each of a MultiDiscrete) is set by the last key
+    pressed that has a value for it. An axis (Box) has the value given, or that of the held key which is furthest from neutral, so
+    that a zero does not override a negative direction. Without input the action is neutral. Unknown keys are ignored."""
     space = spec.action
     rows = [np.asarray(spec.keys[code], np.float64) for code in [*held, *_together(spec, held)] if code in spec.keys]
     flat = neutral_action(spec).ravel().astype(np.float64)

@@ -1,9 +1,7 @@
-"""A world's memory, for the page: its map, and its pictures with the invented part tinted.
+"""A world's memory, for the page: its map, and its pictures with the invented part tinted. The channels decide:
 
-Channels decide, not the kind of world. With `pose` and `places` [N, 4] (x, y in metres, heading in radians, kind: 0 empty,
-1 recorded, 2 observed, 3 imagined, 4 walkable) it has a map of places; with `mosaic` [H', W', 4] its map is a picture; with
-`known` [H, W] in 0..1 its pictures can be tinted.
-"""
+`pose` and `places` [N, 4] (x, y in metres, heading in radians, kind: 0 empty, 1 recorded, 2 observed, 3 imagined, 4 walkable) give
+a map of places; `mosaic` [H', W', 4] is a map as a picture; `known` [H, W] in 0..1 tints pictures."""
 
 import base64
 import io

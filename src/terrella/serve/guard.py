@@ -33,11 +33,8 @@ def is_loopback(host: str) -> bool:
 
 
 def refusal(headers: dict[str, str], host: str, token: str | None, given: str | None) -> str:
-    """Why a request is refused, in one sentence; empty if it may pass.
-
-    A server on this machine answers only to this machine's names (another site cannot reach it by DNS rebinding), a browser
-    must come from our own page (`Origin` equals `Host`), and the token must be right.
-    """
+    """Why a request is refused, in one sentence; empty if it may pass. A server on this machine answers only to this machine's
+    names (against DNS rebinding), a browser must come from our page (`Origin` equals `Host`), and the token must be right."""
     own, origin = headers.get("host", ""), headers.get("origin")
     try:
         name = urlsplit(f"//{own}").hostname or ""

@@ -33,11 +33,8 @@ class Moment:
 
 
 class History:
-    """Moments in order: at most `frames` of them, and states of the newest that fit in `state_bytes`.
-
-    Counted are the storages of a state's tensors and the arena rows (keyframes) that it points at. Storage that several
-    states share is counted once.
-    """
+    """Moments in order: at most `frames` of them, and states of the newest that fit in `state_bytes`: storages of tensors and arena
+    rows (keyframes), each counted once, even if several states share it."""
 
     def __init__(self, frames: int, state_bytes: int):
         if frames < 1:

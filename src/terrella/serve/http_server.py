@@ -75,12 +75,8 @@ def application(
     token: str | None,
     policy: str | None = None,
 ) -> Starlette:
-    """A page as an ASGI application.
-
-    index:  the first file, below web/; or a function that makes its content, which nobody sees without the token.
-    host:   the address that it is bound to, which decides the Host headers that it answers.
-    policy: its own Content-Security-Policy.
-    """
+    """A page as an ASGI application. index: the first file, below web/, or a function that makes its content, which needs the
+    token; host: the bound address, which decides the accepted Host headers; policy: its own Content-Security-Policy."""
     kinds = {f"/{file.relative_to(WEB).as_posix()}": KINDS.get(file.suffix) for file in WEB.rglob("*.*")}
     contents = {path: ((WEB / path[1:]).read_bytes(), kind) for path, kind in kinds.items() if kind}
     if isinstance(index, str):

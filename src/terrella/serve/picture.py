@@ -33,11 +33,8 @@ def read_picture(path: str | Path, size: tuple[int, int]) -> torch.Tensor:
 
 
 def picture_of(data: bytes, size: tuple[int, int], most_pixels: int = MAX_PIXELS, name: str = "this") -> torch.Tensor:
-    """An image of any size and aspect, upright as its EXIF says, cut from its middle and scaled: uint8 [H, W, 3] of `size`.
-
-    Its size is checked before a pixel is decoded, and only Pillow's plug-ins for FORMATS read it. ServeError if it is another
-    kind of file, is damaged, or has more than `most_pixels`.
-    """
+    """An image of any size, upright by its EXIF orientation, cropped to its middle and scaled: uint8 [H, W, 3] of `size`. Its size
+    is checked before decoding. ServeError if it is not of FORMATS, is damaged, or has more than `most_pixels`."""
     height, width = size
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as image:

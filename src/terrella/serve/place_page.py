@@ -83,12 +83,9 @@ class PlacePage:
         )
 
     def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "") -> bytes:
-        """The page with these edits, as HTML in UTF-8.
-
-        save:   the address to which it posts edits; without one it offers them as a file.
-        watch:  the address of newer states of a place that is being fitted, which cannot be edited meanwhile.
-        frames: the address that draws for browsers that cannot.
-        """
+        """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
+        the address of newer states of a place that is being fitted, without editing; frames: the address that renders for browsers
+        that cannot."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
@@ -265,9 +262,6 @@ def serve_place(
     token: str | None = None,
     on_ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Serves the page of a place until interrupted.
-
-    On any address but this machine's own a token is mandatory, because the page can change the place: one is made if none
-    is given, and the address that `on_ready` gets carries it. ServeError where the port is taken.
-    """
+    """Serves the page of a place until interrupted. On any address but this machine's own a token is mandatory, because the page
+    can change the place: one is made if none is given; `on_ready` gets the address with it. ServeError where the port is taken."""
     serve_page(lambda token: build_place(place, host, token), host, port, token, on_ready, websockets=False)

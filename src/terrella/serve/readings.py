@@ -21,10 +21,7 @@ def picture(rgb: np.ndarray, across: int, quality: int = 88) -> bytes:
 
 
 def depth(depth_m: np.ndarray, span_m: tuple[float, float]) -> bytes:
-    """Little-endian uint32 h, w, float32 near and far of the colours in metres, then float16 [h, w] metres.
-
-    Beyond 65 km it is inf.
-    """
+    """Little-endian uint32 h, w, float32 near and far of the colours in metres, then float16 [h, w] metres, inf beyond 65 km."""
     step = -(-max(depth_m.shape) // _DEPTH_ACROSS) or 1
     shown = depth_m[::step, ::step]
     with np.errstate(over="ignore"):
@@ -64,8 +61,7 @@ def series(
     bucket, else the minimum and maximum of each bucket or, with `pick`, every n-th reading.
 
     Little-endian uint32 mode, n, k, index of the first reading; float64 [n] seconds; then EXACT: float64 [n, k];
-    ENVELOPE: float64 [n, k] minima, float64 [n, k] maxima, without empty buckets. NaN stays NaN.
-    """
+    ENVELOPE: float64 [n, k] minima, float64 [n, k] maxima, without empty buckets. NaN stays NaN."""
     first = max(0, int(np.searchsorted(time_s, start_s, "left")) - 1)
     last = min(len(time_s), int(np.searchsorted(time_s, stop_s, "right")) + 1)
     time_s, values = time_s[first:last], values[first:last, :MOST_COLUMNS]

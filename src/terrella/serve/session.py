@@ -28,12 +28,9 @@ FUTURES_EVERY_S = 0.5  # at least, between two of them
 
 
 class Session:
-    """Steps its timeline only while fewer than `MAX_UNACKED` frames are under way. The latest controls win.
-
-    `run` is its one task. Messages other than controls and acknowledgements are executed in order between steps, so that two
-    never touch the timeline at once. Without a socket it pauses and waits to be attached again; its recording is closed then,
-    because another page may want to record.
-    """
+    """Steps its timeline only while fewer than `MAX_UNACKED` frames are under way; the latest controls win. `run` is its one task,
+    which executes other messages in order between steps. Without a socket it pauses, with its recording closed, until it is
+    attached again."""
 
     def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor, book: KeyBook | None = None):
         self.id = secrets.token_urlsafe(16)

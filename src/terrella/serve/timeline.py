@@ -64,9 +64,8 @@ def check_playable(worlds: Sequence[World]) -> None:
 class Timeline:
     """Not thread-safe, and slow: the session calls it from one worker thread, one method at a time.
 
-    The first world is played; a learned world beside it, the dream, gets the same actions. policy: may drive in place of the
-    person (driver.py). history_s, state_mb: as in ServeConfig. keys: the spec with other keys than the world's own.
-    """
+    The first world is played; a learned world beside it, the dream, gets the same actions. policy: may drive in place of the person
+    (driver.py). history_s, state_mb: as in ServeConfig. keys: the spec with other keys than the world's own."""
 
     def __init__(
         self,

@@ -25,11 +25,8 @@ _BUCKETS = 4096  # of a series, at most
 
 
 class Viewable(Protocol):
-    """A recording that can be viewed. One thread calls its methods; only `export` runs beside others.
-
-    Each may raise a TerrellaError, whose sentence the page shows. A sensor has a name and a kind: "image", "depth", "points" or
-    "vector". Episodes are numbered from 0.
-    """
+    """A recording that can be viewed. One thread calls its methods; only `export` runs beside others. Each may raise a
+    TerrellaError. A sensor has a name and a kind: "image", "depth", "points" or "vector". Episodes are numbered from 0."""
 
     def about(self) -> dict:
         """JSON: name, robot, fps (or None), notes (sentences), can_export, and sensors, a list of: name, label, kind,
@@ -268,11 +265,8 @@ def view(
     on_ready: Callable[[str], None] | None = None,
     export_to: str | Path | None = None,
 ) -> None:
-    """Serves the page of a recording until interrupted.
-
-    `on_ready` gets the address to open. `export_to` is the one folder into which the page may export; it must not exist
-    yet. On any address but this machine's own a token is mandatory: one is made if none is given, and the address carries
-    it. ServeError where the port is taken.
-    """
+    """Serves the page of a recording until interrupted. `on_ready` gets the address; `export_to`, which must not exist, is the one
+    folder into which the page may export. On any address but this machine's own a token is mandatory: one is made if none is
+    given, and the address carries it. ServeError where the port is taken."""
     build = lambda token: build_viewer(viewable, host, token, export_to)  # noqa: E731
     serve_page(build, host, port, token, on_ready, websockets=False)

@@ -19,14 +19,11 @@ FRAMES_PER_SECOND = 60
 class AtariWorld(GymnasiumWorld):
     """`AtariWorld("ALE/Breakout-v5")`: one step is `frames` frames of the console (Mnih et al. 2015).
 
-    size:   (height, width) of rgb, area-averaged from the 210x160 screen; None keeps the screen's size.
-    frames: frame skip; the picture is the maximum of the last two frames, because sprites flicker.
-    sticky: probability that a frame repeats the last action (Machado et al. 2018). With 0 the game is deterministic and
-            forkable.
-    noops:  an episode starts after 1 to `noops` random no-op frames.
+    size: (height, width) of rgb, area-averaged from 210x160 (None: as it is); frames: frame skip, the picture is the maximum of
+    the last two frames, because sprites flicker; sticky: probability that a frame repeats the last action (Machado et al. 2018),
+    0: deterministic and forkable; noops: an episode starts after 1 to `noops` random no-op frames.
 
-    Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, at game over; lives float32 [B].
-    """
+    Channels: rgb uint8 [B, H, W, 3]; reward, the points of the step; done, at game over; lives float32 [B]."""
 
     def __init__(
         self,

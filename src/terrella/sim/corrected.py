@@ -1,9 +1,6 @@
-"""Corrected: a simulator with a learned residual, which corrects each step by how a real robot differs from it.
-
-A world model from few real episodes: the simulator predicts most, a small ensemble the rest (residual physics, Zeng et al. 2019;
-neural-augmented simulation, Golemo et al. 2018). Backlash is an input as a bank of play operators (the Prandtl-Ishlinskii model
-of hysteresis), because few episodes do not teach a network such a long memory.
-"""
+"""Corrected: a simulator with a learned residual, which corrects each step by the difference from a real robot, so that few
+episodes suffice (residual physics, Zeng et al. 2019; neural-augmented simulation, Golemo et al. 2018). Backlash is an input as a
+bank of play operators (the Prandtl-Ishlinskii model of hysteresis), a memory too long to be learned from few episodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,10 +1,8 @@
 """ViZDoom as a World: the real game, with named buttons, exact depth and the camera's pose.
 
-Doom's own depth buffer has 8 bits (about 7 map units per level), so depth is ray cast exactly from the map's sectors, and the
-buffer is used only where it shows something nearer (a sprite). One metre is 32 map units, the usual scale. The channel `things`
-masks everything that may move or vanish (monsters, shots, pick-ups, doors, lifts) and should not enter a map. `objects` has the
-position of each sprite, `instances` its pixels.
-"""
+Doom's depth buffer has 8 bits (about 7 map units per level), so depth is ray cast from the map's sectors, and the buffer is used
+only for nearer sprites. One metre is 32 map units. `things` masks everything that may move or vanish and should not enter a map;
+`objects` has the position of each sprite, `instances` its pixels."""
 
 import contextlib
 import os
@@ -75,10 +73,9 @@ class Doom:
 
     A scenario with the player's health has the channels `health`; `things` bool [h, w], the mask of sprites, doors and lifts;
     `objects` [OBJECTS, 4], the visible sprites, nearest first: a persistent number (0: none) and the position of its feet, metres;
-    and `instances` uint8 [h, w], the row of `objects` at each pixel, counted from 1. It has the buttons ATTACK and USE if its
-    configuration has them. On a map of a game, a kill and the exit give reward 1, death gives -1, and episodes start at the map's
-    start or at a pick-up.
-    """
+    and `instances` uint8 [h, w], the row of `objects` at each pixel, counted from 1. ATTACK and USE exist if its configuration has
+    them. On a map of a game, a kill and the exit give reward 1, death -1, and episodes start at the map's start or at a
+    pick-up."""
 
     def __init__(self, config: DoomConfig | None = None):
         self.config = config = config or DoomConfig()

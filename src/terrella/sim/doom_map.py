@@ -53,9 +53,8 @@ def skies(wad: Path, name: str) -> np.ndarray:
 
 
 class Sectors:
-    """The map as prisms. Floors and ceilings move: `update` reads their heights again; `dynamic` marks the sectors that differ from
-    the start of the episode (an open door, a moving lift) or have no height (a closed door).
-    """
+    """The map as prisms. `update` reads the heights of floors and ceilings again; `dynamic` marks sectors that differ from the
+    start of the episode (an open door, a moving lift) or have no height (a closed door)."""
 
     def __init__(self, sectors, sky: np.ndarray):
         lines = [np.array([(w.x1, w.y1, w.x2, w.y2) for w in s.lines], np.float64).reshape(-1, 4) for s in sectors]
@@ -89,10 +88,8 @@ class Sectors:
     def depth(
         self, x: float, y: float, eye: float, yaw: float, camera: Intrinsics, size: tuple[int, int], farthest: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Depth along the optical axis float64 [H, W], and the visible sector int32 [H, W] (-1: a wall, the sky).
-
-        Map coordinates and units, yaw in radians.
-        """
+        """Depth along the optical axis float64 [H, W], and the visible sector int32 [H, W] (-1: a wall, the sky), in map units;
+        yaw in radians."""
         depth, sector = np.empty(size), np.empty(size, np.int32)
         parts = self.lines, self.solid, self.first, self.heights, self.sky
         cast_prisms(*parts, x, y, eye, yaw, camera, farthest, depth, sector)

@@ -27,11 +27,9 @@ class EnvironmentFacts:
 
 
 def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
-    """Reads the facts from the environment.
-
-    Action names: `get_action_meanings` and the like, an `Actions` enum, or any attribute with "action" in its name that names each
-    action. Keys: `get_keys_to_action`. Time: `dt`, `tau` or metadata["render_fps"]. names: action names that are already known.
-    """
+    """Reads the facts from the environment. Action names: `names`, `get_action_meanings` and the like, an `Actions` enum, or any
+    attribute with "action" in its name that names each action. Keys: `get_keys_to_action`. Time: `dt`, `tau` or
+    metadata["render_fps"]."""
     space, bare = env.action_space, env.unwrapped
     labels, source = (tuple(names), "its adapter") if names else _names(bare, space)
     dt_s, clock = _step_seconds(env)

@@ -22,8 +22,7 @@ _EXTRA = re.compile(r"gymnasium\[(box2d|mujoco)\]")  # extras of Gymnasium that 
 
 def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> tuple[gymnasium.Env, str]:
     """(environment, name) of an id, "module:Id" or a function. An id is made without its time limit; modules are also searched in
-    the working directory. TerrellaError where it cannot be made.
-    """
+    the working directory. TerrellaError where it cannot be made."""
     if callable(env):
         built = env()
         return built, f"gym:{built.spec.id if built.spec else type(built.unwrapped).__name__}"

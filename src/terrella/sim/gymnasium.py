@@ -101,16 +101,13 @@ class GymnasiumConfig:
 
 
 class GymnasiumWorld:
-    """`GymnasiumWorld("CartPole-v1")`.
-
-    env: an id, made without its time limit (which becomes Spec.max_episode_steps, kept by `as_env`), or a function that returns a
-         new environment at each call.
+    """`GymnasiumWorld("CartPole-v1")`. env: an id, made without its time limit (which becomes Spec.max_episode_steps, kept by
+    `as_env`), or a function that returns a new environment at each call.
 
     Channels: observation [B, *shape] (each array of a Dict is its own channel), reward float32 [B], done bool [B] (terminated, or
     truncated by the environment, see `truncated` in the state), rgb uint8 [B, H, W, 3]. After `done` the world stands still with
     reward 0. `start` uses `rng`, and so does each `imagine` if the world is forkable. spec.card["how"] says where facts about the
-    environment come from. TerrellaError where the environment cannot be found, made, reset or rendered, and for Tuple spaces.
-    """
+    environment come from. TerrellaError where the environment cannot be found, made, reset or rendered, and for Tuple spaces."""
 
     def __init__(self, env: str | Callable[[], gymnasium.Env], config: GymnasiumConfig = GymnasiumConfig()):
         self._lock = threading.Lock()  # all episodes share one environment, so only one may step at a time

@@ -1,7 +1,4 @@
-"""Islet-v0: our own small game, a scrolling island with stars to collect.
-
-terrella play gym:Islet-v0
-"""
+"""Islet-v0: our own small game, a scrolling island with stars to collect. `terrella play gym:Islet-v0`"""
 
 from functools import cache
 from typing import ClassVar
@@ -21,12 +18,9 @@ _CAT_DELAY = 8  # steps by which the cat follows
 
 
 class Islet(gymnasium.Env):
-    """The walker moves two pixels per step, and the picture scrolls with it; a cat follows its path. Ducks, sheep, butterflies and
-    a boat move back and forth, and the mill turns. There are fifteen stars (reward 1 each); a collected star lights up in the sky.
-    The island is fixed; the seed draws the start and the phase of the moving things. The episode terminates with the last star.
-
-    Observation: uint8 [80, 96, 3]. Action: noop, up, down, left, right.
-    """
+    """The walker moves two pixels per step, and the picture scrolls with it; other things move on fixed paths. There are fifteen
+    stars (reward 1 each), which then light up in the sky; the last one terminates the episode. The island is fixed; the seed draws
+    the start and the phase of the moving things. Observation: uint8 [80, 96, 3]. Action: noop, up, down, left, right."""
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": 15}
     action_space = spaces.Discrete(len(_ACTIONS))

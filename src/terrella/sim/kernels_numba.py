@@ -12,8 +12,7 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthes
 
     lines [N, 4] = x1, y1, x2, y2; rows first[s] to first[s + 1] belong to sector s. solid [N]: walls. heights [S, 2]: floor,
     ceiling. sky [S]: the ceiling is open sky. Depth is along the optical axis, in map units, `farthest` at most and for the sky.
-    `sector` is the one whose floor, ceiling or edge is seen, -1 for walls and the sky.
-    """
+    `sector`: that of the floor, ceiling or edge in view, -1 for walls and the sky."""
     rows, columns = depth.shape
     fx, fy, cx, cy = camera
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -65,8 +64,7 @@ def cast_prisms(lines, solid, first, heights, sky, x, y, z, yaw, camera, farthes
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def sorted_cuts(ahead, right, low, high, side, cuts):
     """Fills `cuts` with the distances at which a column, `side` to the right per unit ahead, alternately enters and leaves the
-    sector of lines low to high; returns their number. A camera inside the sector enters at 0.
-    """
+    sector of lines low to high; returns their number. A camera inside the sector enters at 0."""
     count = 0
     for n in range(low, high):
         cut = crossing(ahead, right, n, side)

@@ -79,9 +79,8 @@ class Canvas:
 
 
 def simplify(model: Any, size: tuple[int, int]) -> None:
-    """Makes a model cheap to render in small pictures, in place: infinite floors, which MuJoCo renders many times slower, become
-    finite; meshes lose details finer than a pixel; round geoms get fewer faces; there is no antialiasing.
-    """
+    """Makes a model cheap to render in small pictures, in place: finite floors (infinite ones are many times slower), no details
+    of meshes finer than a pixel, fewer faces of round geoms, no antialiasing."""
     if max(size) > SMALL:
         return
     endless = (model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE)) & (model.geom_size[:, :2] == 0).all(1)

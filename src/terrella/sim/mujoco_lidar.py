@@ -13,8 +13,7 @@ SITE, MAX_ELEVATION = "lidar", np.radians(15.0)  # several rows span this angle 
 
 class Lidar:
     """rays: per turn, or (rows, rays per turn). range_m: the largest distance. The first ray points along the site's x axis, the
-    next ones turn towards its y axis. The body that carries the site is ignored.
-    """
+    next ones turn towards its y axis. The body that carries the site is ignored."""
 
     def __init__(self, model: mujoco.MjModel, rays: int | Sequence[int], range_m: float):
         shape = (rays,) if isinstance(rays, int) else tuple(rays)

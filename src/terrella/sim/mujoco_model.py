@@ -54,8 +54,7 @@ def bare(spec: mujoco.MjSpec, model: mujoco.MjModel, name: str) -> mujoco.MjMode
 
 def complete(spec: mujoco.MjSpec, name: str) -> mujoco.MjSpec:
     """Adds missing parts to `spec`: a position servo for each joint if there are no actuators, a floor if the world is empty, and a
-    camera that shows the whole model if there is none.
-    """
+    camera that shows the whole model if there is none."""
     spec.compiler.discardvisual = False  # URDF files set it
     if not spec.actuators and any(joint.type not in (FREE, BALL) for joint in spec.joints):
         _name_joints(spec)

@@ -16,8 +16,7 @@ MAX_PUSH, MAX_LIFT = 4.0, 6.0  # m/s²; a tilt of 22 degrees
 
 class Multirotor:
     """A cascaded controller: velocity, tilt, thrusts (Lee et al. 2010, "Geometric tracking control of a quadrotor", without its
-    feed-forward). Actions: velocities forward, left and up in m/s in the level frame that turns with the body; turning in rad/s.
-    """
+    feed-forward). Actions: velocities forward, left and up in m/s in the level frame that turns with the body; turning in rad/s."""
 
     names, units = ("forward", "left", "up", "turn"), ("m/s", "m/s", "m/s", "rad/s")
     high = (3.0, 3.0, 1.5, 2.0)

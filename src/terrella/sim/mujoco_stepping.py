@@ -27,8 +27,7 @@ class Stepper:
         self, physics: torch.Tensor, warmstart: torch.Tensor, ctrl: torch.Tensor, values: torch.Tensor, steps: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """`steps` steps from float64 physics [B, n], the solver's warmstart [B, nv] and controls [B, nu]. Returns the physics, the
-        sensors [B, n] at the start of the last step, and the next warmstart: the acceleration over the last step.
-        """
+        sensors [B, n] at the start of the last step, and the next warmstart: the acceleration over the last step."""
         batch, model = len(physics), self.file
         controls = ctrl[:, None].expand(batch, steps, model.nu).contiguous().numpy()
         states = np.empty((batch, steps, physics.shape[1]))

@@ -36,12 +36,8 @@ class RobotLayout:
 
 
 class RobotTask(Protocol):
-    """A task.
-
-    channels:   the channels that `render` shows.
-    initialise: changes the initial qpos [B, nq] and qvel [B, nv] in place; returns the task's own tensors of the state.
-    evaluate:   reward, termination and the task's tensors after a step.
-    """
+    """channels: those that `render` shows; initialise: changes the initial qpos [B, nq] and qvel [B, nv] in place and returns the
+    task's own tensors of the state; evaluate: reward, termination and the task's tensors after a step."""
 
     rewards: bool  # whether `reward` is a channel
 
@@ -79,11 +75,8 @@ class Free:
 
 @dataclass(frozen=True)
 class VelocityTracking:
-    """A free body follows a commanded velocity (Rudin et al. 2021, "Learning to walk in minutes").
-
-    `command` is forward and sideways in m/s and turning in rad/s, in the body's frame, drawn uniformly within these limits when an
-    episode starts.
-    """
+    """A free body follows a commanded velocity (Rudin et al. 2021, "Learning to walk in minutes"). `command` is forward and
+    sideways in m/s and turning in rad/s, in the body's frame, drawn uniformly within these limits when an episode starts."""
 
     rewards = True
     forward: tuple[float, float] = (0.3, 1.0)  # m/s
@@ -164,8 +157,7 @@ class VelocityTracking:
 @dataclass(frozen=True)
 class Stepping(VelocityTracking):
     """Velocity tracking with a periodic gait, whose phase is observed (Siekmann et al. 2021, "Sim-to-real learning of all common
-    bipedal gaits via periodic reward composition").
-    """
+    bipedal gaits via periodic reward composition")."""
 
     # Site of each foot, with sensors foot_SITE, place_SITE and speed_SITE -> its phase offset, as a share of the period.
     feet: Mapping[str, float] = field(default_factory=lambda: {"left_foot": 0.0, "right_foot": 0.5})
@@ -208,8 +200,7 @@ class Stepping(VelocityTracking):
 @dataclass(frozen=True)
 class Reach:
     """The hand reaches a goal, drawn uniformly in a box when an episode starts. Reward: minus the distance in m. Observation:
-    joints, their speeds, the goal, and the vector from the goal to the hand.
-    """
+    joints, their speeds, the goal, and the vector from the goal to the hand."""
 
     rewards = True
     hand: str = "hand"  # sensor of the hand's position
@@ -245,8 +236,7 @@ class Reach:
 @dataclass(frozen=True)
 class Hold:
     """The hand reaches a goal in its plane (x, z), drawn in a ring around the origin when an episode starts, and holds it:
-    `success` is 1 after `dwell` consecutive steps within `within` m.
-    """
+    `success` is 1 after `dwell` consecutive steps within `within` m."""
 
     rewards = True
     hand: str = "hand"  # sensor of the hand's position

@@ -12,9 +12,8 @@ from .mujoco_stepping import Stepper
 
 
 class WarpStepper(Stepper):
-    """Worlds of one model on one CUDA device, in float32; states are CPU tensors. Contacts and LiDAR, computed world by world, stay
-    with MuJoCo. Parameters cannot differ between worlds. TerrellaError without mujoco-warp or a GPU.
-    """
+    """Worlds of one model on one CUDA device, in float32; states are CPU tensors. Contacts and LiDAR stay with MuJoCo on the CPU.
+    Parameters cannot differ between worlds. TerrellaError without mujoco-warp or a GPU."""
 
     def __init__(self, file: mujoco.MjModel, device: str):
         super().__init__(file, {}, 1)

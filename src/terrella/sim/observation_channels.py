@@ -41,8 +41,7 @@ class ObservationPart:
 
 def parts_of(space: spaces.Space, name: str, rgb: bool, drawn: bool) -> dict[str, ObservationPart]:
     """Channel -> part. The arrays of a Dict keep their names; a picture among them becomes `rgb` if that is wanted and the
-    environment renders none itself (`drawn`). TerrellaError where there is no array.
-    """
+    environment renders none itself (`drawn`). TerrellaError where there is no array."""
     if not isinstance(space, spaces.Dict):
         check_space(space, name)
         form = picture_form(space) if rgb else ""
@@ -120,9 +119,8 @@ def space_of(value: Any, kind: str) -> spaces.Space:
 
 
 def value_at(env: Any, info: Mapping, path: str) -> Any:
-    """The value at "info.depth", a key of the last `info`, or at "camera.pose", attributes of the bare environment; methods are
-    called.
-    """
+    """The value at "info.depth", a key of the last `info`, or at "camera.pose", attributes of the bare environment (methods are
+    called)."""
     words, value = path.split("."), env
     if words[0] == "info":
         value, words = info, words[1:]

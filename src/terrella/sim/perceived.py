@@ -16,11 +16,8 @@ GOAL, ESTIMATE = "goal", "perceived.goal"
 class Perceived(WorldWrapper[World]):
     """`Perceived(world, encoder)`, for a world whose states have a `goal` [B, n] and which shows `camera`.
 
-    encoder:  pictures uint8 [B, H, W, 3] -> goals float32 [B, n], in the goal's units. It sees one picture, at the start of an
-              episode.
-    channels: those that are rendered with the estimated goal; all others, such as reward and success, use the true one.
-    TerrellaError where there is no such camera or no goal.
-    """
+    encoder: one picture at the start of an episode, uint8 [B, H, W, 3] -> goals float32 [B, n], in the goal's units; channels:
+    those rendered with the estimated goal; all others use the true one. TerrellaError where there is no such camera or no goal."""
 
     def __init__(
         self,

@@ -43,10 +43,8 @@ class _Worker:
 class Processes:
     """Parallel episodes behind the methods of a World. `make` is sent to each process and builds a ProcessEpisode there.
 
-    A state is a ticket: the number of each entry's episode and its age. A new episode is reset when it is first rendered or
-    stepped, in a process that no other entry of that state uses; so after `state.put(index, fresh)` it takes over the process of
-    the episode that it replaces.
-    """
+    A state is a ticket: the number of each entry's episode and its age. A new episode is reset when first rendered or stepped, in a
+    process that no other entry of that state uses; after `state.put(index, fresh)`, that of the episode which it replaces."""
 
     def __init__(self, name: str, make: Callable[[], ProcessEpisode]):
         self._name, self._make = name, make

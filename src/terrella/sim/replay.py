@@ -14,15 +14,13 @@ from ..core.state import State
 class ReplayWorld:
     """One episode of T + 1 frames.
 
-    channels:     name -> array or tensor [T + 1, ...], row t as a World renders it at frame t: `reward` and `done` are those
-                  of the step to frame t; row 0 has 0 and False. Memory-mapped arrays are read on demand.
-    actions:      [T, *action.shape], the action from frame t to t + 1, kept as `actions`.
-    action:       the action space; `imagine` checks its actions, and otherwise ignores them.
-    spaces_given: name -> space, where the default (the dtype's whole range) is too wide.
+    channels: name -> array or tensor [T + 1, ...], row t as a World renders it at frame t: `reward` and `done` are those of the
+    step to frame t; row 0 has 0 and False. Memory-mapped arrays are read on demand. actions: [T, *action.shape], from frame t to t
+    + 1. action: the action space; `imagine` checks its actions, and otherwise ignores them. spaces_given: name -> space, where the
+    default (the dtype's whole range) is too wide.
 
     `done` is True on the last frame, and where the recording says so. After the end the last frame stays, with reward 0.
-    The world is forkable, for any batch. float16 and float64 channels are shown as float32. TerrellaError where lengths differ.
-    """
+    The world is forkable, for any batch. float16 and float64 channels are shown as float32. TerrellaError where lengths differ."""
 
     def __init__(
         self,

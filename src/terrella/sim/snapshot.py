@@ -1,9 +1,8 @@
 """Snapshots of the Python state of a Gymnasium environment as plain numbers, which make it forkable.
 
 A snapshot has every attribute of the environment and its wrappers that is a number, None, a flat list or tuple of numbers, or a
-numeric array. Text and nested containers must not change. An environment with any other attribute (a physics engine, an open
-file, its own random generator) is refused, because a copy would be incomplete.
-"""
+numeric array; text and nested containers must not change. An environment with any other attribute (a physics engine, an open file,
+its own random generator) is refused, because a copy would be incomplete."""
 
 import copy
 from collections.abc import Sequence

@@ -1,8 +1,5 @@
-"""Direct alignment: the planar motion between two pictures, found by warping the first with its depth onto the second.
-
-Dense visual odometry (Steinbruecker et al. 2011; Kerl et al. 2013) with three unknowns: Gauss-Newton on differences of
-brightness, coarse to fine, with robust weights for outliers (occlusions, moving objects).
-"""
+"""Direct alignment: the planar motion between two pictures, found by warping the first with its depth onto the second. Dense visual
+odometry (Steinbruecker et al. 2011; Kerl et al. 2013) with three unknowns: robust Gauss-Newton on brightness, coarse to fine."""
 
 import torch
 import torch.nn.functional as F
@@ -16,11 +13,10 @@ _HELD = 0.2  # strength of the prior for no motion
 def align(
     before: torch.Tensor, after: torch.Tensor, depth: torch.Tensor, camera: Intrinsics, pace: torch.Tensor
 ) -> torch.Tensor:
-    """before and after [B, 3, H, W] at any scale of brightness; depth [B, H, W] metres of the first; pace [3], the usual size of
-    a step -> [B, 3]: metres forward, metres to the left (in the frame of the first), radians to the left.
+    """The motion [B, 3] between `before` and `after` [B, 3, H, W], at any scale of brightness: metres forward and to the left in
+    the frame of the first, radians to the left. depth [B, H, W]: metres, of the first; pace [3]: the usual step.
 
-    Starts from no motion, both turns, and steps forward and back at the coarsest level, and refines the best of them.
-    """
+    Starts at the coarsest level from no motion, both turns, and steps forward and back, and refines the best."""
     grey = [picture.float().mean(1, keepdim=True) for picture in (before, after)]
     starts = torch.tensor([[0, 0, 0], [0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0]], device=depth.device) * 0.7 * pace
     motions = [start.expand(len(before), 3) for start in starts]

@@ -1,8 +1,6 @@
-"""Billboards: objects as upright pictures that face the camera, cut out of frames and painted into them.
-
-A billboard has a place, that of its feet (x, y, z in metres, world frame), a picture [4, *PICTURE] (rgb and cover in [0, 1])
-and a box [4], its extent to the left, to the right, below and above its feet, in metres across the line of sight.
-"""
+"""Billboards: objects as upright pictures that face the camera, cut out of frames and painted into them. A billboard has the place
+of its feet (x, y, z in metres, world frame), a picture [4, *PICTURE] (rgb and cover in [0, 1]) and a box [4], its extent to the
+left, to the right, below and above its feet, in metres across the line of sight."""
 
 from typing import NamedTuple
 
@@ -79,12 +77,11 @@ def paint_billboards(
     pose: torch.Tensor,
     camera: Intrinsics,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Frames with billboards painted into them, behind nearer surfaces: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and
-    the number of the billboard seen at a pixel, from 1 (uint8 [B, H, W], 0: none).
+    """Frames with billboards painted behind nearer surfaces: rgb [B, 3, H, W] in [0, 1], depth [B, H, W] metres, and the number of
+    the billboard at each pixel, from 1 (uint8 [B, H, W], 0: none).
 
-    rgb and depth are the background; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; present
-    [B, K] bool says which of them exist.
-    """
+    rgb and depth are the background; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; present [B, K]
+    bool."""
     if rgb.device.type != "cpu":
         return paint_billboards_slowly(rgb, depth, billboards, present, pose, camera)
     order, present, sides, far = _placed(billboards, present, pose, camera, depth.shape[-2:])

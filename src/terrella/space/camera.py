@@ -1,8 +1,7 @@
 """Pinhole cameras and rigid poses: pixels to rays, depth to points, points to pixels.
 
 Frames: world z up; camera x forward, y left, z up. A pose is float32 [..., 7]: x, y, z in metres, then the quaternion
-w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H).
-"""
+w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H)."""
 
 import torch
 
@@ -56,10 +55,8 @@ def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> to
 
 
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
-    """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N].
-
-    Points behind the camera have depth <= 0 and meaningless coordinates.
-    """
+    """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N]. Points
+    behind the camera have depth <= 0 and meaningless coordinates."""
     fx, fy, cx, cy = camera
     local = (points - pose[..., None, :3]) @ rotation(pose)
     depth = local[..., 0]

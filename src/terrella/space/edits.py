@@ -1,18 +1,15 @@
-"""Edits of a place: each is a line of JSON, so that a place is its source and its edits: replayable, diffable, undone line by line.
+"""Edits of a place, one line of JSON each:
 
     {"select": {"box": [x0, y0, z0, x1, y1, z1]}, "do": "move", "by": [dx, dy, dz]}
 
-select: box; sphere [x, y, z, radius]; brush [x, y, z, radius, x, y, z, radius, ...], where one went over it with spheres; plane
-[a, b, c, d], where a x + b y + c z > d; object, its number; all true. do: move or duplicate (by, metres); turn (degrees about the
-vertical through the middle); scale (factor, about the middle); recolour (colour, 0 to 1); delete. One edit selects nothing:
+select: box; sphere [x, y, z, radius]; brush, the numbers of many spheres; plane [a, b, c, d], where a x + b y + c z > d; object,
+its number; all true. do: move or duplicate (by, metres); turn (degrees about the vertical through the middle); scale (factor,
+about the middle); recolour (colour, 0 to 1); delete. One edit selects nothing and adds another place, turned about the vertical
+through its origin, then moved; its objects are numbered after the first's:
 
     {"do": "merge", "place": "../other", "sha256": "...", "by": [dx, dy, dz], "degrees": 90}
 
-adds all of another place, turned about the vertical through its origin, then moved; its objects are numbered on from the first's.
-
-The page edits with the same language (serve/web/place/edits.js). Both compute places in double precision and keep them in
-single, so that they choose the same Gaussians.
-"""
+The page has the same edits (serve/web/place/edits.js). Both compute in double precision and store in single, so that they agree."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -48,9 +45,9 @@ class Contents(Protocol):
 
 @dataclass(frozen=True)
 class Edited:
-    """The Gaussians after edits; origin int64 [N], which of the first ones, followed by those of all merged places, each still is,
-    -1 for those that an edit made or changed; objects int32 [N], the number of the object that each belongs to, 0 for none. A
-    duplicate is a new object. raised: by how much each merge raised the numbers of its objects."""
+    """The Gaussians after edits; origin int64 [N]: the index of each among the first ones and those of all merges, -1 if made or
+    changed by an edit; objects int32 [N]: the object of each, 0 for none (a duplicate is a new object); raised: what each merge
+    added to the numbers of its objects."""
 
     gaussians: Gaussians
     origin: torch.Tensor
@@ -64,8 +61,7 @@ def apply_edits(
     objects: torch.Tensor | None = None,
     other: Callable[[Edit], Contents] | None = None,
 ) -> Edited:
-    """Edits done one after another; objects int32 [N], by default none; `other` opens the place that a merge names. ContractError
-    for what is no edit."""
+    """Applies edits in order. objects int32 [N]; `other` opens the place of a merge. ContractError for a wrong edit."""
     origin, known, raised = torch.arange(len(gaussians)), len(gaussians), []
     objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
     for edit in edits:
@@ -100,7 +96,7 @@ def merges_of(edits: Sequence[Edit]) -> list[Edit]:
 
 
 def merged_boxes(boxes: torch.Tensor, edit: Edit) -> torch.Tensor | None:
-    """Upright boxes [K, 6] (low and high corners) of a merged place; None where it was turned by no quarter."""
+    """Upright boxes [K, 6] (low and high corners) of a merged place; None if it was not turned by a multiple of 90 degrees."""
     quarters = edit["degrees"] / 90
     if quarters != round(quarters):
         return None
@@ -192,5 +188,5 @@ def _numbers(given: Any, count: int, name: str) -> torch.Tensor:
 
 
 def _plain(number: Any) -> bool:
-    """Whether it is a number, and one that float32 holds well."""
+    """Whether it is a number within the range of float32."""
     return isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e30

@@ -1,5 +1,5 @@
-"""Estimator: what a picture alone says of space: how far everything is, how the viewer moved since the one before, and whether
-it looks like the pictures that it learned from. Trained by learn/objectives/estimator.py."""
+"""Estimator: depth from one picture, motion between two, and the distance from the training pictures; trained by
+learn/objectives/estimator.py."""
 
 import json
 from collections.abc import Mapping
@@ -23,9 +23,8 @@ _USUAL = 0.99  # the share of pictures like those that it learned from whose str
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """size: height and width at which it looks, multiples of 16; near_m and far_m: the range of the depth that it may
-    answer; channels: of its maps at 1/2, 1/4, 1/8 and 1/16 of the size; camera: intrinsics of the pictures that it learned
-    from (camera.py)."""
+    """size: height and width of its input, multiples of 16; near_m and far_m: the range of depth; channels: of its maps at 1/2,
+    1/4, 1/8 and 1/16 of the size; camera: intrinsics of the training pictures (camera.py)."""
 
     size: tuple[int, int] = (48, 64)
     near_m: float = 0.1
@@ -35,8 +34,7 @@ class EstimatorConfig:
 
 
 class Estimator(nn.Module):
-    """A small U-Net that sees a picture in its own brightness and contrast and gives logarithmic depth; motion follows from the
-    depth, by direct alignment of two pictures."""
+    """A small U-Net from a normalised picture to logarithmic depth; motion by direct alignment of two pictures with that depth."""
 
     kind = "network"
     prior: torch.Tensor  # logit of the mean code of the recordings' depth, at each pixel
@@ -70,8 +68,8 @@ class Estimator(nn.Module):
         return (1 / near).clamp(self.config.near_m, self.config.far_m)
 
     def motion(self, before: torch.Tensor, after: torch.Tensor, depth: torch.Tensor | None = None) -> torch.Tensor:
-        """How the viewer moved between two consecutive pictures, uint8 [B, 3, H, W] each: [B, 3] metres forward and to the
-        left in the frame of the first, radians turned to the left. `depth` [B, h, w] of the first in metres, where known."""
+        """The motion between consecutive pictures, uint8 [B, 3, H, W] each: [B, 3] metres forward and to the left in the frame of
+        the first, radians to the left. `depth` [B, h, w]: of the first in metres, if known."""
         metres = self.depth(before) if depth is None else depth.float()
         size = (2 * self.config.size[0], 2 * self.config.size[1])  # motion is finer than depth
         first, second = self._seen(before, size), self._seen(after, size)
@@ -95,8 +93,8 @@ class Estimator(nn.Module):
         return (self.prior + F.pixel_shuffle(self.output(F.silu(x)), 2)[:, 0]).sigmoid()
 
     def looks(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Of pictures, uint8 [B, 3, H, W], how much their two finest maps vary, the mean and contrast of each colour and the
-        logarithm of its differences along either axis: [B, D]."""
+        """Features [B, D] of pictures uint8 [B, 3, H, W]: variance in the two finest maps; mean and contrast of each colour;
+        logarithm of the differences along each axis."""
         picture = self._seen(rgb)
         kept, _ = self._encode(normalise(picture))
         steps = [picture.diff(dim=axis).abs().mean((2, 3)).clamp_min(1e-3).log() for axis in (2, 3)]

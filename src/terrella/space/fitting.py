@@ -1,8 +1,6 @@
-"""Fits Gaussians to posed pictures with depth (stereo.py estimates missing depth).
-
-They start on the surfaces in the depth images and are optimised by gradient descent. Adding Gaussians where the error is large
-and relocating transparent ones follow Kheradmand et al. 2024 (3DGS as MCMC), with positions from depth.
-"""
+"""Fits Gaussians to posed pictures with depth (stereo.py estimates missing depth) by gradient descent, from the surfaces in the
+depth images. Adding Gaussians where the error is large and relocating transparent ones follow Kheradmand et al. 2024 (3DGS as
+MCMC)."""
 
 from __future__ import annotations
 

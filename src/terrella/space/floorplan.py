@@ -1,7 +1,5 @@
-"""Floor plans from depth images: straight walls at the camera's height, and bodies that slide along them.
-
-World frame, metres; a body is an axis-aligned upright box, as in Doom and Quake.
-"""
+"""Floor plans from depth images: straight walls at the camera's height, and bodies that slide along them. World frame, metres; a
+body is an axis-aligned upright box, as in Doom and Quake."""
 
 import torch
 import torch.nn.functional as F
@@ -24,12 +22,10 @@ GAP_M = 0.5  # columns farther apart do not join; no body fits through less
 
 
 def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """Depth [K, h, w] (0: nothing known) from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
+    """Depth [K, h, w] (0: unknown) from level poses [K, 7] -> walls [K, WALLS, 4] = x1, y1, x2, y2.
 
-    On the horizon the inverse depth of a flat wall is linear in the column. Each run of columns on one line is a wall, and
-    two runs that meet are extended to their corner. Walls farther than SEEN_M, or so far that neighbouring columns are half a
-    metre apart (32 m for a wall seen head-on by 128 columns over 90 degrees), are left out.
-    """
+    On the horizon the inverse depth of a flat wall is linear in the column; runs that meet are extended to their corner. Walls
+    farther than SEEN_M, or so far that neighbouring columns are half a metre apart, are left out."""
     width, row = depth.shape[-1], horizon(camera, depth.shape[-2])
     columns = torch.arange(width, dtype=torch.float64, device=depth.device)
     left = -((columns + 0.5) / width - camera[2]) / camera[0]
@@ -111,11 +107,8 @@ def _apart(one, other, slope, level) -> torch.Tensor:
 
 
 def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
-    """The walls [K, n, 4] that keyframes at `pose` [K, 7] saw, merged into one floor plan: [S, 4].
-
-    Each wall is moved to the mean line of all collinear walls, weighted by length and nearness, and its ends to the crossing
-    with another wall within 4 cm. This reduces errors from millimetres to tenths of a millimetre.
-    """
+    """The walls [K, n, 4] of keyframes at `pose` [K, 7], merged into one floor plan: [S, 4]. Each is moved to the mean line of all
+    collinear walls, weighted by length and nearness, and its ends to the crossing with another wall within 4 cm."""
     real = walls[..., 0] < NOWHERE
     origin = pose[:, None, :2].expand(-1, walls.shape[1], -1)[real].double()
     start, end = walls[real].double().split(2, -1)
@@ -175,12 +168,9 @@ def slide(
     walls: torch.Tensor, places: torch.Tensor, wish: torch.Tensor, half_m: float, short: float = 0.0,
     own: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """The motion of bodies of half width `half_m` at `places` [B, 2] that try to move by `wish` [B, 2], among walls [S, 4] that
-    all share and `own` walls [B, n, 4].
-
-    At a wall the rest of the motion continues along it, twice at most. A body stops `short` (a share of the wish) of a wall.
-    Returns the displacement [B, 2] and the remaining motion, the momentum [B, 2].
-    """
+    """The motion of bodies of half width `half_m` at `places` [B, 2] that try to move by `wish` [B, 2], among shared walls [S, 4]
+    and `own` walls [B, n, 4]. At a wall the rest of the motion continues along it, twice at most. A body stops `short` (a share of
+    the wish) of a wall. Returns the displacement [B, 2] and the remaining motion, the momentum [B, 2]."""
     own = walls.new_zeros(len(places), 0, 4) if own is None else own
     if places.device.type != "cpu":
         return slide_slowly(walls, places, wish, half_m, short, own)

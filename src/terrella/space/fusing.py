@@ -1,7 +1,5 @@
-"""Fuses one posed picture with depth into a scene of Gaussians, without a fit (like the surfels of Keller et al. 2013).
-
-The weight of each Gaussian at each pixel is the gradient of the picture by its colour, so that one rendering gives all sums.
-"""
+"""Fuses one posed picture with depth into a scene of Gaussians, without a fit (like the surfels of Keller et al. 2013). The weight
+of each Gaussian at each pixel is the gradient of the picture by its colour, so that one rendering gives all sums."""
 
 from dataclasses import replace
 
@@ -28,9 +26,8 @@ def fuse(
     """The scene after a picture rgb float32 [3, H, W] in 0..1 with depth [H, W] in metres (0: unknown, FAR_M: empty) from pose [7];
     the weights [N]; and which Gaussians the picture showed: bool [N].
 
-    weight [N] is the sum of pixels in which each Gaussian was seen so far; colours are running means with it. Gaussians that the
-    picture sees through fade. New surfaces replace transparent Gaussians among `spare` [S].
-    """
+    weight [N] is the sum of pixels that showed each Gaussian; colours are running means with it. Gaussians that the picture sees
+    through fade. New surfaces replace transparent Gaussians among `spare` [S]."""
     size = (rgb.shape[-2], rgb.shape[-1])
     with torch.inference_mode(False), torch.enable_grad():
         bare = torch.zeros(len(scene), 1, 3, requires_grad=True)

@@ -1,10 +1,8 @@
 """Posed RGB-D keyframes as spatial memory: what is known of a new view, and from which keyframes.
 
-`retrieve` asks which keyframes know a view: their coarse patches say roughly which surfaces it sees; each keyframe then
-votes for the surfaces that it saw itself (occlusion included), and those that add most are taken greedily. `look` casts
-their fine patches for the view's depth, and warps their colours into it. Both take a batch of views, and two lots of
-keyframes: `shared` ones, ready to be looked at, and `own` ones as a memory keeps them, of which each view may use some.
-"""
+`retrieve` chooses keyframes greedily by their votes for the surfaces in the view, which coarse patches give. `look` renders the
+depth of the view from fine patches, and warps colours into it. There are two sets of keyframes: `shared` by all views, with fine
+patches, and `own`, of which each view uses some."""
 
 from __future__ import annotations
 
@@ -28,9 +26,8 @@ ANYWAY = 0.02  # of its strongest vote counts for a keyframe, so that more than 
 
 @dataclass(frozen=True)
 class Keyframes:
-    """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], its rotation `turn` [K, 3, 3],
-    patches [K, n, 9] (the fine ones, n = 0 where they are yet to be made) and the walls that it saw [K, n, 4]
-    (floorplan.py)."""
+    """K keyframes: rgb uint8 [K, 3, H, W], depth float32 [K, h, w] metres, pose [K, 7], its rotation `turn` [K, 3, 3], patches
+    [K, n, 9] (fine: n = 0 until they are made), and the walls in view [K, n, 4] (floorplan.py)."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -97,10 +94,8 @@ def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple
 
 @dataclass(frozen=True)
 class Glimpse:
-    """What memory knows of B views: colours [B, slots, 3, H, W] in [0, 1] and how trusted [B, slots, H, W], best first;
-    the depth of the nearest known surface [B, H, W] (holes filled, FAR_M where nothing is known); known [B, H, W], 1 where
-    depth is known and at least one keyframe agrees.
-    """
+    """What is known of B views: colours [B, slots, 3, H, W] in [0, 1] and their trust [B, slots, H, W], best first; depth of the
+    nearest known surface [B, H, W], FAR_M where nothing is known; known [B, H, W]: 1 where a keyframe agrees with that depth."""
 
     rgb: torch.Tensor
     trust: torch.Tensor
@@ -124,13 +119,11 @@ def retrieve(
     shared: Keyframes, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], count: int,
     own: Keyframes | None = None, rows: torch.Tensor | None = None,
 ) -> torch.Tensor:  # fmt: skip
-    """Which keyframes to use for the views of `size` from `pose` [B, 7], `count` each at most: int64 [B, count], numbers of
-    shared ones, the best first, then len(shared) + those of own ones, of which a view may use its `rows` [B, n] (0: none);
-    -1: no more.
+    """The keyframes for views of `size` from `pose` [B, 7], the best first: int64 [B, count], numbers of shared ones, then
+    len(shared) + those of own ones, of which a view may use its `rows` [B, n] (0: none); -1: no more.
 
-    Coverage-greedy: a keyframe's vote at a point is how alike its distance is (1 equal, 1/2 at twice or half), 0 where
-    it saw something else there; each pick adds what the picks before it lack.
-    """
+    A keyframe's vote at a point is the ratio of the distances (1 if equal, 1/2 at twice or half), 0 if it sees something else
+    there. Each pick adds most to the votes of the picks before it."""
     if own is None or rows is None:
         own, rows = Keyframes.none(size, pose.device), torch.zeros(len(pose), 0, dtype=torch.int64, device=pose.device)
     if pose.device.type != "cpu":
@@ -164,8 +157,7 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
 
 
 def vote_slowly(depth, pose, points, distance, camera) -> torch.Tensor:
-    """[B, K, P]: what keyframes with depth [B, K, h, w] from pose [B, K, 7] say of points [B, P, 3] that lie `distance` [B, P]
-    deep in the new views."""
+    """Votes [B, K, P] of keyframes with depth [B, K, h, w] from pose [B, K, 7] for points [B, P, 3] at depth `distance` [B, P]."""
     height, width = depth.shape[-2:]
     where, ahead = project(points[:, None].expand(-1, depth.shape[1], -1, -1), pose, camera)
     inside = (ahead > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)[:, None]
@@ -248,8 +240,8 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
 
 
 def recall_slowly(rgb, depth, poses, valid, seen, pose, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
-    """Colours [B, slots, 3, H, W] and trust [B, slots, H, W] of the most trusted that keyframes (rgb [B, S, 3, h, w] in [0, 1],
-    depth [B, S, h, w], poses [B, S, 7], valid [B, S]) know of the surfaces that lie `seen` [B, H, W] deep from `pose` [B, 7]."""
+    """The most trusted colours [B, slots, 3, H, W] of the surfaces at depth `seen` [B, H, W] from `pose` [B, 7], and their trust
+    [B, slots, H, W]: from keyframes rgb [B, S, 3, h, w] in [0, 1], depth [B, S, h, w], poses [B, S, 7], valid [B, S]."""
     colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera)
     likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
     sure = torch.where(valid[..., None, None], agreement * likeness**2, -1.0)

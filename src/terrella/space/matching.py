@@ -1,5 +1,4 @@
-"""Motion between consecutive pictures by displacements ("moves", x and y in whole pixels): which of them explain a pixel, and
-by which most of a picture scrolls."""
+"""Motion between consecutive pictures by displacements ("moves", x and y in whole pixels): of pixels, and of the whole picture."""
 
 import torch
 import torch.nn.functional as F
@@ -58,11 +57,9 @@ def half_pixel_bounds_slowly(frame: torch.Tensor) -> torch.Tensor:
 
 
 def source_shares(frames: torch.Tensor, truth: torch.Tensor, moves: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """How well each source (see `gather_sources`) explains each pixel of the next frames `truth` (uint8 [B, 3, H, W]).
-
-    Returns shares in 0..1 [B, sources, H, W], from the differences of the pixel and of the 5 x 5 around it, with up to half a
-    pixel of tolerance for displaced sources; and the largest difference (of 255) from the unchanged pixel [B, H, W].
-    """
+    """How well each source (see `gather_sources`) explains each pixel of the next frames `truth` (uint8 [B, 3, H, W]): shares in
+    0..1 [B, sources, H, W], from the 5 x 5 pixels around it, displaced with a tolerance of half a pixel; and the largest
+    difference (of 255) from the unchanged pixel [B, H, W]."""
     if frames.device.type != "cpu":
         return source_shares_slowly(frames, truth, moves)
     share = torch.empty(len(frames), len(moves) + frames.shape[1] - 1, *truth.shape[-2:])
@@ -92,11 +89,8 @@ def source_shares_slowly(
 
 
 def prefer_scroll(share: torch.Tensor, along: torch.Tensor) -> torch.Tensor:
-    """The result of `source_shares` [B, sources, H, W], reduced by what preferred sources explain.
-
-    The order is: the move `along` [B, H, W], by which the picture scrolls there; the unchanged pixel; all others. Otherwise
-    every source would explain a plain surface.
-    """
+    """The result of `source_shares` [B, sources, H, W], reduced by what preferred sources explain: first the move `along` [B, H,
+    W] by which the picture scrolls there, then the unchanged pixel. Otherwise every source would explain a plain surface."""
     index = along[:, None]
     scroll_index, stays = share.gather(1, index), share[:, :1]
     left = share * (1 - CLEAR * scroll_index) * (1 - CLEAR * stays)
@@ -107,11 +101,9 @@ def prefer_scroll(share: torch.Tensor, along: torch.Tensor) -> torch.Tensor:
 def majority_colours(
     frames: torch.Tensor, share: torch.Tensor, painted: torch.Tensor, moves: torch.Tensor, stress: float | torch.Tensor
 ) -> torch.Tensor:
-    """The colour of each pixel that most votes support, uint8 [B, 3, H, W]: mean shift's mode, but one of the given colours.
-
-    The colours are those of the sources (see `gather_sources`) with shares [B, sources + 1, H, W] and, last, of `painted` uint8
-    [B, 3, H, W]. Many sources of one background outvote one of an object before it. The unchanged pixel counts `stress` times.
-    """
+    """The colour of each pixel that most votes support, uint8 [B, 3, H, W]: mean shift's mode, but one of the given colours, those
+    of sources (see `gather_sources`) with shares [B, sources + 1, H, W] and, last, of `painted` uint8 [B, 3, H, W]. Sources of one
+    background outvote one of an object before it. The unchanged pixel counts `stress` times."""
     if frames.device.type != "cpu":
         return majority_colours_slowly(frames, share, painted, moves, stress)
     drawn = torch.empty(painted.shape, dtype=torch.uint8)

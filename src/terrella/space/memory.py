@@ -1,9 +1,7 @@
-"""Memory: what an episode has seen and dreamt, as posed RGB-D keyframes that its State points at, within a byte budget.
+"""Memory: the posed RGB-D keyframes that an episode has observed and imagined, within a byte budget.
 
-It keeps a dreamt frame that shows a new view of which much had to be invented; evidence it keeps always, in the place of
-what it held of that view. When it is full it forgets the keyframe whose view the others cover best (evidence is covered by
-evidence alone), and of equals a dreamt one before an observed one, the oldest first.
-"""
+Observations are always kept, imagined frames only if their view is new and mostly invented. A full memory drops the keyframe whose
+view the others cover best (an observation is covered by observations only), imagined ones and old ones first."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,8 +21,8 @@ from .views import arrays, over_views
 
 EMPTY, RECORDED, OBSERVED, DREAMT = range(4)  # kinds of keyframes
 PAGE = 16  # the capacity of a memory is a multiple of this, if it is larger
-_EVERY = 11  # every so-manyth coarse patch of a keyframe is a point that another may cover
-_ALIKE = 0.02  # views whose covered shares differ by less are covered equally well
+_EVERY = 11  # coverage is measured at every 11th coarse patch of a keyframe
+_ALIKE = 0.02  # smaller differences of coverage do not count
 
 ROWS = "memory_rows"  # the pointer into the arena: where an episode's keyframes lie
 Held = Mapping[str, torch.Tensor]  # a State, or the part of one that is memory's: the tensors of `Memory.empty`
@@ -32,12 +30,11 @@ Held = Mapping[str, torch.Tensor]  # a State, or the part of one that is memory'
 
 @dataclass(frozen=True)
 class Memory:
-    """The rules of a memory. What an episode holds is in its State, by the row of an arena that all episodes share.
+    """The rules of a memory; the keyframes of an episode are rows of an arena, to which its State points.
 
-    camera: intrinsics of all keyframes; size: height and width of their pictures; budget_mb: MiB that one episode may take;
-    new_view: metres and radians from the nearest keyframe, whose sum of shares makes a view new; known_enough: share of a
-    dreamt frame that memory knew, above which it is not kept; device: where the arena lies.
-    """
+    camera: intrinsics of all keyframes; size: height and width of their pictures; budget_mb: MiB of one episode; new_view: metres
+    and radians: a view is new if its distances from each keyframe, in these units, add up to more than 1; known_enough: imagined
+    frames of which memory knows a larger share are not kept; device: where the arena lies."""
 
     camera: Intrinsics
     size: tuple[int, int] = (96, 128)
@@ -67,7 +64,7 @@ class Memory:
 
     @cached_property
     def keyframe_bytes(self) -> int:
-        """Of one keyframe: its row, and its pose, kind, age and row number in the state."""
+        """Bytes of a keyframe: its row of the arena, and its pose, kind, age and row number in the state."""
         return self._arena.row_bytes + 7 * 4 + 1 + 8 + 8
 
     @cached_property
@@ -82,7 +79,7 @@ class Memory:
         return self.capacity * self.keyframe_bytes
 
     def empty(self, batch: int) -> dict[str, torch.Tensor]:
-        """The tensors of memories that hold nothing."""
+        """The tensors of empty memories."""
         kinds = {"pose": torch.float32, "kind": torch.uint8, "born": torch.int64, "rows": torch.int64}
         shape = batch, self.capacity
         return {
@@ -91,12 +88,11 @@ class Memory:
         }
 
     def of(self, state: Held) -> dict[str, torch.Tensor]:
-        """The tensors of `state` that are memory's."""
+        """The tensors of memory in `state`."""
         return {name: state[name] for name in self.empty(0)}
 
     def adopted(self, state: State) -> State:
-        """`state` with what it remembers in this memory's arena: itself where it lies there. ContractError where it is of
-        another layout."""
+        """`state` with its keyframes in this memory's arena. ContractError for another layout."""
         arena = state.arenas.get(ROWS)
         if arena is self._arena or (arena is None and ROWS in state):
             return state
@@ -123,17 +119,17 @@ class Memory:
     def observed(
         self, held: Held, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """The tensors that change where evidence is kept: rgb uint8 [B, 3, H, W], depth [B, H, W] metres, pose [B, 7]."""
+        """The changed tensors after an observation: rgb uint8 [B, 3, H, W], depth [B, H, W] metres, pose [B, 7]."""
         return self._keep(held, OBSERVED, rgb, depth, pose, torch.ones(len(rgb), dtype=torch.bool, device=rgb.device))
 
     def dreamt(
         self, held: Held, rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, known: torch.Tensor
     ) -> dict[str, torch.Tensor]:
-        """The same for dreamt frames of which memory knew `known` [B, H, W] in 0..1: kept if new, and enough invented."""
+        """The same for imagined frames, `known` [B, H, W] in 0..1 of memory: only new and mostly invented ones are kept."""
         return self._keep(held, DREAMT, rgb, depth, pose, known.mean((1, 2)) < self.known_enough)
 
     def nearest(self, held: Held, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """How far [B] the view from `pose` [B, 7] is from the nearest keyframe, above 1 for a new view; its slot [B]."""
+        """The distance [B] from `pose` [B, 7] to the nearest keyframe, above 1 for a new view, and that keyframe's slot [B]."""
         far, turn = self.new_view
         here, kept = pose[:, None], held["memory_pose"]
         away = (kept[..., :3] - here[..., :3]).norm(dim=-1) / far
@@ -169,8 +165,7 @@ class Memory:
         return changed
 
     def _room(self, held: Held, views: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """The slot for a new keyframe of each of `views` [n]: a free one, or, where one is `wanted` [n], that of the one which
-        is forgotten."""
+        """A slot for a new keyframe of each of `views` [n]: a free one or, where `wanted` [n], that of the keyframe to drop."""
         kind, born = held["memory_kind"][views], held["memory_born"][views]
         free, slot = (kind == EMPTY).max(1)
         full = wanted & ~free
@@ -184,8 +179,8 @@ class Memory:
         return slot.index_put((some,), torch.where(full[some], forgotten, slot[some]))
 
     def covered(self, held: Held, views: torch.Tensor) -> torch.Tensor:
-        """How well the others cover the view of each keyframe of those `views` [n], whose memories are full, 0..1:
-        [n, capacity]. At points of the surfaces that it saw, the best vote of another: did it see them too, from as near?"""
+        """The share [n, capacity] of the view of each keyframe that others cover, in full memories `views` [n]: the mean over
+        points of its surfaces of the best vote of another keyframe."""
         rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
         if rows.device.type != "cpu":
             return self.covered_slowly(held, views)
@@ -208,13 +203,11 @@ class Memory:
     # -- recalling ----------------------------------------------------------------------------------------------------
 
     def keyframes(self, held: Held, view: int) -> Keyframes:
-        """The keyframes of one episode, copied, as memory keeps them: without fine patches."""
-        rows = held[ROWS][view][held["memory_kind"][view] > EMPTY]
-        return self._keyframes(held).at(rows)
+        """A copy of the keyframes of one episode, without fine patches."""
+        return self._keyframes(held).at(held[ROWS][view][held["memory_kind"][view] > EMPTY])
 
     def walls(self, held: Held, dreamt: bool = True) -> torch.Tensor:
-        """The walls [B, n, 4] that the keyframes of each episode saw (floorplan.py), with `dreamt` those of dreams, too; NOWHERE
-        for those that are none."""
+        """The walls [B, n, 4] in the keyframes (floorplan.py), NOWHERE in empty rows; `dreamt`: with imagined keyframes."""
         rows, kind = held[ROWS], held["memory_kind"]
         counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
         walls = self._arena_of(held).read("walls")[rows]
@@ -223,15 +216,13 @@ class Memory:
     def look(
         self, held: Held, pose: torch.Tensor, sources: int = 6, slots: int = 3, recorded: Keyframes | None = None
     ) -> Glimpse:
-        """What memory, and `recorded` keyframes that all episodes share, know of the views from `pose` [B, 7].
-
-        `sources` keyframes are found for a view by their votes on its surfaces; `slots` of them show at each pixel.
-        """
+        """What is known of the views from `pose` [B, 7], by memory and by `recorded` keyframes that all episodes share. At most
+        `sources` keyframes are used for a view, and at most `slots` for a pixel."""
         shared = Keyframes.none(self.size, pose.device) if recorded is None else recorded
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)
         picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
-        # of equally trusted ones a recorded one comes first
+        # with equal trust, a recorded one comes first
         turn = torch.where(picks < 0, 2, (picks >= len(shared)).long())
         picks = picks.gather(1, turn.argsort(dim=1, stable=True))
         return look(shared, picks, pose, self.camera, self.size, slots, own)
@@ -247,6 +238,6 @@ class Memory:
 
 
 def keyframe_table(pose: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
-    """Poses [..., 7] and kinds [...] as float32 [..., 4] = x, y in metres, heading in radians, kind; zeros where empty."""
+    """float32 [..., 4] = x, y in metres, heading in radians, kind, from poses [..., 7] and kinds [...]; zeros in empty slots."""
     row = torch.cat([pose[..., :2], yaw(pose)[..., None], kind[..., None].float()], -1)
     return torch.where((kind > EMPTY)[..., None], row, 0.0)

@@ -1,8 +1,5 @@
-"""The mosaic: the map and the memory of a flat world, its pictures stitched by how they scroll.
-
-Its middle is the current picture. Each of its pixels holds the colour that most pictures had there (a majority vote, Boyer and
-Moore 1981), so that objects in front of the background leave no trace.
-"""
+"""The mosaic: the map and the memory of a flat world, its pictures stitched by how they scroll, with the current one in the middle.
+A pixel holds its most frequent colour (a majority vote, Boyer and Moore 1981), so that objects in front leave no trace."""
 
 import torch
 import torch.nn.functional as F

@@ -23,8 +23,8 @@ _THINGS, _WALKER = 1, 2  # bits: walls and things meet, and things meet the walk
 
 
 class RigidBodies:
-    """Bodies 1 to K of boxes float32 [S, 6] (low and high corners): `owner` [S] says whose each is, 0 of what stays where it is.
-    `body` walks among them; a step takes `dt_s`."""
+    """Bodies 1 to K of boxes float32 [S, 6] (low and high corners) with `owner` [S] (0: static), and `body`, who walks among them,
+    in steps of `dt_s`."""
 
     def __init__(self, boxes: torch.Tensor, owner: torch.Tensor, body: Walker, dt_s: float):
         self.body, self.dt_s, self.steps = body, dt_s, max(round(dt_s / STEP_S), 1)
@@ -75,8 +75,8 @@ class RigidBodies:
     def step(
         self, poses: torch.Tensor, speeds: torch.Tensor, eye: torch.Tensor, goal: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Poses [B, K, 7] and speeds [B, K, 6] (m/s, rad/s) a step later, and where who walks from `eye` to `goal` [B, 3] has
-        come. Where all are still and nobody is near nothing is computed."""
+        """Poses [B, K, 7] and speeds [B, K, 6] (m/s, rad/s) a step later, and the end [B, 3] of a walk from `eye` to `goal` [B, 3].
+        Entries at rest with nobody near are not simulated."""
         near = (poses[..., :2] - goal[:, None, :2]).norm(dim=2) < self._reach + self.body.radius_m + 0.15
         level = (goal[:, None, 2] - poses[..., 2]).abs() < self._reach + self.body.eye_m + 0.2
         touched = (near & level).any(1)

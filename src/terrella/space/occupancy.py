@@ -1,7 +1,5 @@
-"""An occupancy grid of a place, computed from its Gaussians, and how walkers move in it.
-
-World frame, metres, z up. A walker is an upright cylinder; its place is the position of its eye.
-"""
+"""An occupancy grid of a place, computed from its Gaussians, and how walkers move in it. World frame, metres, z up. A walker is an
+upright cylinder; its place is the position of its eye."""
 
 from __future__ import annotations
 

@@ -1,10 +1,6 @@
-"""Patches: the small parallelograms that the pixels of posed depth images cover in the world, cast into a new view.
-
-Every pixel of a depth image becomes the piece of tangent plane that it sees. A view intersects each pixel's ray with
-the patches that project there and keeps the nearest: slanted and very near surfaces come out exact and without holes.
-Compiled kernels do both on a CPU (kernels_numba/surfaces.py); `patches_slowly` and `cast_slowly` are their obvious twins, and
-the way on a GPU.
-"""
+"""Patches: a parallelogram in the world for each pixel of posed depth images, rendered into a new view by ray casting.
+So slanted and very near surfaces have exact depth without holes. On a CPU, kernels_numba/surfaces.py does both; the slow twins
+also run on GPUs."""
 
 import torch
 
@@ -16,13 +12,12 @@ SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall
 
 
 def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
-    """Depth [..., H, W] seen from `pose` [..., 7] -> patches [..., N, 9]: centre, half side across, half side down.
+    """Depth [..., H, W] seen from `pose` [..., 7] -> patches [..., N, 9]: centre, half side across, half side down (metres, world
+    frame).
 
-    One patch for every stride x stride block, N = (H // stride) * (W // stride); metres, world frame. Sides overlap
-    their neighbours' by half, and cross(down, across) points towards the camera that saw them. A patch that would reach
-    over an edge in the depth image keeps to its own pixel; one that is too slanted to be distinguished from a bridge between two
-    surfaces shrinks to nothing, lest from the side it be a wall across the room.
-    """
+    One patch per stride x stride block, N = (H // stride) * (W // stride). Sides overlap their neighbours' by half, and
+    cross(down, across) points towards the camera. At a depth edge a patch covers only its own pixel; one that is too slanted to be
+    distinguished from a bridge between two surfaces has size 0."""
     if depth.device.type != "cpu":
         return patches_slowly(depth, pose, camera, stride)
     height, width = depth.shape[-2:]
@@ -53,7 +48,7 @@ def patches_slowly(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, 
 
 
 def _shorter_difference(points: torch.Tensor, axis: int) -> torch.Tensor:
-    """Of the backward and the forward difference along `axis`, the shorter one: it stays on one surface."""
+    """The shorter of the backward and the forward difference along `axis`, which stays on one surface."""
     step = points.diff(dim=axis)
     before = torch.cat([step.narrow(axis, 0, 1), step], axis)
     after = torch.cat([step, step.narrow(axis, step.shape[axis] - 1, 1)], axis)
@@ -62,7 +57,7 @@ def _shorter_difference(points: torch.Tensor, axis: int) -> torch.Tensor:
 
 
 def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
-    """True where the image of 1 / depth is a plane (as that of any flat surface is) out to a patch's rim: [..., H, W]."""
+    """True where 1 / depth is a plane out to a patch's rim, as on any flat surface: [..., H, W]."""
     inverse = 1 / depth.clamp_min(NEAR_M)
     rim = max(1, round(0.75 * stride))
     images = inverse.reshape(-1, 1, *depth.shape[-2:])
@@ -79,8 +74,7 @@ def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
 def cast_slowly(
     patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], chunk: int = 512
 ) -> torch.Tensor:
-    """Depth [B, H, W] that the view from `pose` [B, 7] sees of `patch` [B, N, 9], FAR_M where it sees none, by trying every patch
-    on every pixel; also for GPUs."""
+    """Depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], FAR_M where there is none: tries every patch at every pixel."""
     turn = rotation(pose)
     centre = torch.einsum("bji,bnj->bni", turn, patch[..., :3] - pose[:, None, :3])
     across, down = (torch.einsum("bji,bnj->bni", turn, patch[..., k : k + 3]) for k in (3, 6))

@@ -39,11 +39,9 @@ def thumbnails(rgb: torch.Tensor) -> torch.Tensor:
 def recognise(
     picture: torch.Tensor, memory: Keyframes, small: torch.Tensor, camera: Intrinsics, sources: int
 ) -> RecognisedPose | None:
-    """The best pose for a level picture, uint8 [3, H, W], among `memory` with its `thumbnails`; None in an empty memory.
-
-    Keyframes are compared with the picture under small turns of the camera. A local search around the best renders memory at
-    each pose. The caller decides from the likeness whether the result is right.
-    """
+    """The best pose for a level picture, uint8 [3, H, W], among `memory` with its `thumbnails`; None in an empty memory. Keyframes
+    are compared under small turns of the camera, then a local search renders memory at each pose. The caller judges the
+    likeness."""
     if not len(memory):
         return None
     views = [

@@ -1,9 +1,7 @@
-"""Remembering: a World around any generator of pictures, that shows again what was shown before.
+"""Remembering: gives any world that generates pictures a spatial memory, so that it shows again what it showed before.
 
-After the inner world imagines, memory (memory.py) splats its geometry into the new view. Where it is dense its pixels
-reconstruct, where it is sparse the inner world's invention stays; the two are blended, and the inner world observes the
-blend, so that it goes on from it.
-"""
+After each step of the inner world, the known part of the picture is rendered from memory (memory.py) and blended with the inner
+world's picture; the inner world observes the blend."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -33,16 +31,14 @@ _OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 def remember(
     world: World, memory_mb: float = 16.0, estimator: Estimator | None = None, camera: Intrinsics | None = None
 ) -> World:
-    """`world` with a spatial memory. One that shows the channel `known` has its own and draws from it: it stays as it is."""
+    """`world` with a spatial memory. A world that shows the channel `known` has its own and is returned unchanged."""
     return world if "known" in world.spec.channels else Remembering(world, memory_mb, estimator, camera)
 
 
 class Remembering:
-    """The wrapped world. Pose and depth are the inner world's channels; where it lacks one, the estimator's: odometry adds up
-    its motions, level and from the origin. Without depth and estimator all is taken to lie on a sphere around the viewer.
-
-    memory_mb: budget of an episode's memory; camera: intrinsics, where neither the inner world's spec nor the estimator has them.
-    """
+    """The wrapped world. Missing pose and depth come from the estimator: level visual odometry from the origin. Without both,
+    depth is that of a sphere around the camera. memory_mb: budget of an episode; camera: intrinsics, if neither spec nor estimator
+    has them."""
 
     def __init__(
         self,
@@ -76,8 +72,7 @@ class Remembering:
         return self._witnessed(self.world.start(batch, rng), None)
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
-        """Evidence goes to the inner world; a picture among it is kept in memory, else (a pose alone) the new view is drawn
-        with what memory knows."""
+        """The inner world observes. A picture is kept in memory; without one, the new view is rendered from memory."""
         if "rgb" not in observation and not set(observation) & set(self.world.spec.observes):
             raise ObservationError(
                 f"{self.spec.name} observes {', '.join(self.world.spec.observes)}; got {list(observation)}."
@@ -113,7 +108,7 @@ class Remembering:
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _witnessed(self, inner: State, prior: State | None) -> State:
-        """The state in which the inner world's picture is evidence."""
+        """The state after an observed picture."""
         seen, rgb, depth, pose = self._seen(inner, prior)
         held = State(self.memory.empty(len(rgb)), self.memory.arenas) if prior is None else prior
         held = held.replace(**self.memory.observed(held, rgb, depth, pose))
@@ -121,11 +116,9 @@ class Remembering:
         return self._joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
 
     def _drawn(self, inner: State, before: State, rng: torch.Generator) -> State:
-        """The state in which the inner world's invention and what memory knows of the view are one picture.
-
-        rng: as it was before the invention, so that a batch equals its singles where the inner world's verbs draw alike: all
-        once an entry, say (core/chance.py), or the blend's observation nothing.
-        """
+        """The state after the inner world's picture and the known part of the view are blended. rng: as before the inner world's
+        step, so that a batch equals its single entries if both methods of the inner world draw once an entry, or `observe` draws
+        nothing."""
         seen, rgb, depth, pose = self._seen(inner, before)
         glimpse = self.memory.look(before, pose)
         rgb, known = blend(glimpse, rgb)
@@ -140,7 +133,7 @@ class Remembering:
         return self._joined(inner, seen, held, rgb=rgb, depth=depth, pose=pose, known=known)
 
     def _seen(self, inner: State, before: State | None) -> tuple[dict, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """What the inner world shows, and of it rgb uint8 [B, 3, H, W], depth [B, H, W] metres and pose [B, 7]."""
+        """The inner world's channels, and of them rgb uint8 [B, 3, H, W], depth [B, H, W] metres and pose [B, 7]."""
         seen = dict(self.world.render(inner, self._shown))
         rgb = seen["rgb"].permute(0, 3, 1, 2).contiguous()
         if "depth" in seen:
@@ -154,7 +147,7 @@ class Remembering:
         return seen, rgb, depth, seen["pose"].float() if "pose" in seen else self._felt(rgb, before)
 
     def _felt(self, rgb: torch.Tensor, before: State | None) -> torch.Tensor:
-        """Where odometry says that the picture was taken, `before` being the last; the origin for a first one."""
+        """The pose by odometry from the state `before`; the origin for a first picture."""
         assert self.estimator is not None
         zero = torch.zeros(len(rgb), device=rgb.device)
         if before is None:
@@ -166,7 +159,7 @@ class Remembering:
         return planar_pose(x, y, pose[:, 2], heading + turn)
 
     def _joined(self, inner: State, seen: Mapping, held: State, **own: torch.Tensor) -> State:
-        """The inner world's state, what it shows of reward and end, memory's tensors in `held`, and what is shown."""
+        """The inner world's state with its reward and done, memory's tensors from `held`, and the shown channels."""
         tensors = {f"{_INNER}{name}": tensor for name, tensor in inner.items()}
         followed = {name: seen[name] for name in ("reward", "done") if name in seen}
         arenas = {**{f"{_INNER}{name}": arena for name, arena in inner.arenas.items()}, ROWS: held.arenas[ROWS]}
@@ -174,9 +167,9 @@ class Remembering:
 
 
 def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """What memory knows over what was invented, uint8 [B, 3, H, W]: the picture, and the share of memory in each of its
-    pixels [B, H, W]. That fades out over three pixels towards what is unknown, and where memory saw the place from much
-    farther off; beyond, the invention is brought to the colours that memory has nearby."""
+    """The known colours over the invented picture uint8 [B, 3, H, W], and their share [B, H, W]. The share falls to 0 within three
+    pixels of the unknown and where keyframes were much farther away; there the invented colours are shifted to nearby known
+    ones."""
     inside = least_around(glimpse.known)[:, None]
     share = F.avg_pool2d(inside, 5, 1, 2, count_include_pad=False) * glimpse.known[:, None]
     share = share * (3 * glimpse.trust[:, :1]).clamp(0, 1)
@@ -190,8 +183,7 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
 
 
 def _spec(spec: Spec, memory: Memory, camera: Intrinsics, estimates: bool) -> Spec:
-    """The spec of a world that remembers: with the pose and the depth that memory goes by; `known` [H, W], 1 where memory
-    reconstructs what is shown and 0 where it is invented; and `places` [N, 4] (keyframe_table), in which it can be inspected."""
+    """The spec with pose and depth; `known` [H, W]: 1 where the picture is from memory; `places` (keyframe_table)."""
     channels, units = {"pose": POSE, **spec.channels}, {"pose": POSE_UNIT, **spec.units}
     if "depth" in channels or estimates:  # of the pictures' size
         channels["depth"], units["depth"] = spaces.Box(0, np.inf, memory.size, np.float32), "m"

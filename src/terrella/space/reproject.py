@@ -1,8 +1,5 @@
-"""Carrying what posed RGB-D keyframes saw into another view: a z-buffered splat of depth, then a warp of colour.
-
-Depth is splatted forward (which surface does each pixel of the new view see?), and colour is then fetched backward by
-bilinear sampling, so textures come over sharp and without holes. Keyframes that see another surface there are masked.
-"""
+"""Carries posed RGB-D keyframes into another view: depth by a z-buffered forward splat, then colour by bilinear sampling backward.
+Keyframes that see another surface at a pixel are masked there."""
 
 import torch
 import torch.nn.functional as F
@@ -27,17 +24,14 @@ def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, si
 
 
 def least_around(plane: torch.Tensor) -> torch.Tensor:
-    """The least of each pixel of [B, H, W] and its eight neighbours (a max_pool2d takes many times as long)."""
+    """The minimum over each pixel of [B, H, W] and its eight neighbours (much faster than max_pool2d)."""
     padded = F.pad(plane, (1, 1, 1, 1), value=torch.inf)
     lines = torch.minimum(torch.minimum(padded[:, :-2], padded[:, 2:]), padded[:, 1:-1])
     return torch.minimum(torch.minimum(lines[..., :-2], lines[..., 2:]), lines[..., 1:-1])
 
 
 def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
-    """Depth [B, H, W] with FAR_M in holes -> the same with holes filled from coarser averages (pull-push) of 1/depth.
-
-    Single-pixel leaks (a far surface seen through the gaps of a near, sparsely splatted one) are closed first.
-    """
+    """Depth [B, H, W] with holes (FAR_M) filled by pull-push of 1/depth, after closing single-pixel gaps in near surfaces."""
     if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
     filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
@@ -71,13 +65,11 @@ def warp(
     target_pose: torch.Tensor,
     camera: Intrinsics,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Colour of K keyframes fetched for every pixel of a target view.
+    """Colour of K keyframes for every pixel of a target view.
 
-    rgb [B, K, 3 (or any planes), H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B, 7].
-    Returns colour [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw that very surface, 0 where it
-    saw another or looked elsewhere), and closeness [B, K, H', W'] (distance in the target over distance in the
-    keyframe: above 1 the keyframe was nearer and has more detail).
-    """
+    rgb [B, K, 3 (or any planes), H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B,
+    7]. Returns colour [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw the same surface, 0 where not) and
+    closeness [B, K, H', W']: the distance in the target over that in the keyframe."""
     batch, keys = rgb.shape[:2]
     height, width = target_depth.shape[-2:]
     points = unproject(target_depth, target_pose, camera).flatten(1, 2)
@@ -94,7 +86,7 @@ def warp(
 
 
 def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
-    """How far a depth that is `held` is that of a surface `ahead`, 0..1, where that is `inside` the picture."""
+    """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture."""
     error = (held - ahead).abs() / ahead.clamp_min(0.05)
     return torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
 
@@ -103,9 +95,8 @@ def carry_unknown(
     rgb: torch.Tensor, depth: torch.Tensor, pose: torch.Tensor, known: torch.Tensor,
     target_depth: torch.Tensor, target_pose: torch.Tensor, camera: Intrinsics,
 ) -> torch.Tensor:  # fmt: skip
-    """One frame (rgb uint8 [B, 3, H, W], depth [B, h, w], pose [B, 7]) warped into the view that sees target_depth
-    [B, H', W'] from target_pose [B, 7], where it does not know [B, H', W'] the surface: [B, 4, H', W'] of colour in [0, 1]
-    and trust, 0 elsewhere."""
+    """One frame (rgb uint8 [B, 3, H, W], depth [B, h, w], pose [B, 7]) warped into the view with target_depth [B, H', W'] from
+    target_pose [B, 7]: colour in [0, 1] and trust [B, 4, H', W'], 0 where `known` [B, H', W'] is 1."""
     if not _kernels_do(rgb, depth, pose, known, target_depth, target_pose):
         return carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera)
     carried = torch.zeros(len(rgb), 4, *target_depth.shape[-2:])
@@ -127,9 +118,9 @@ def carry_things(
     rgb: torch.Tensor, depth: torch.Tensor, things: torch.Tensor, covered: torch.Tensor, pose: torch.Tensor,
     target_pose: torch.Tensor, camera: Intrinsics,
 ) -> torch.Tensor:  # fmt: skip
-    """Frames (rgb uint8 [B, 3, H, W]; depth in metres, things in 0..1 and covered bool [B, H, W]; pose [B, 7]) brought into the
-    views from target_pose [B, 7] by their own depth: [B, 6, H, W] = colour, trust, depth and things; all but the depth are 0
-    where the frame did not see, or was `covered`. Pixels are moved whole: what is carried again at every step stays sharp."""
+    """Frames (rgb uint8 [B, 3, H, W]; depth in metres, things in 0..1, covered bool [B, H, W]; pose [B, 7]) in the views from
+    target_pose [B, 7] by their own depth: [B, 6, H, W] = colour, trust, depth, things; all but depth are 0 where unseen or
+    `covered`. Pixels are copied, not interpolated, so that repeated carrying does not blur."""
     given = rgb, depth, things, covered, pose, target_pose
     if not _kernels_do(*given):
         return carry_things_slowly(*given, camera)
@@ -165,13 +156,12 @@ def _closed(depth: torch.Tensor) -> torch.Tensor:
 
 
 def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
-    """Depth [B, H, W] with that of things averaged over their surroundings: a figure whose pixels lie at depths of their own
-    would fall to pieces."""
+    """Depth [B, H, W] with that of things averaged over 9 x 9 pixels, so that a figure stays in one piece."""
     thing = (things > 0.5).float()
     summed = F.avg_pool2d(torch.stack([depth * thing, thing], 1), 9, 1, 4)
     return torch.where(thing > 0, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
 
 
 def _kernels_do(rgb: torch.Tensor, *others: torch.Tensor) -> bool:
-    """Whether compiled kernels take these: on the CPU, bytes of colour, and no gradient asked for."""
+    """Whether the compiled kernels can be used: on the CPU, uint8 colours, no gradients."""
     return rgb.device.type == "cpu" and rgb.dtype == torch.uint8 and not any(part.requires_grad for part in others)

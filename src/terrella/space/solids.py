@@ -1,7 +1,5 @@
-"""The collider of a place whose walls are known: axis-aligned boxes. For other places see occupancy.py.
-
-World frame, metres, z up. A walker is an upright cylinder; its place is the position of its eye.
-"""
+"""The collider of a place whose walls are known: axis-aligned boxes. For other places see occupancy.py. World frame, metres, z up.
+A walker is an upright cylinder; its place is the position of its eye."""
 
 from dataclasses import dataclass
 

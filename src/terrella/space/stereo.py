@@ -1,7 +1,5 @@
-"""Depth of posed pictures by plane sweep (Collins 1996): for each pixel, the depth at which neighbouring pictures agree best.
-
-Locally normalised pictures are compared in small windows. Depths that no other picture confirms are left out.
-"""
+"""Depth of posed pictures by plane sweep (Collins 1996): the depth at which small windows of neighbouring, locally normalised
+pictures agree best. Depths that no other picture confirms are left out."""
 
 from dataclasses import replace
 

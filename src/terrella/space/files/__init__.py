@@ -24,9 +24,9 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
-    """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb (KHR_gaussian_splatting);
-    `axes`: those of the file, by default rub for SPZ and GLB, and rdf for others. What is not finite or farther than 10 km is
-    left out, with a warning that counts it. DatasetError says what is wrong with a file."""
+    """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb
+    (KHR_gaussian_splatting). `axes`: the file's, default rub for SPZ and GLB, else rdf. Gaussians that are not finite or farther
+    than 10 km are left out with a warning. DatasetError for a broken file."""
     path = Path(path)
     if path.suffix.lower() in GLTF_ENDINGS:
         scene = read_gltf(path)
@@ -59,7 +59,7 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
 
 
 def _valid_part(scene: Gaussians, path: Path, axes: str) -> Gaussians:
-    """Those whose numbers are finite and whose places are not absurd, in our axes."""
+    """The Gaussians with finite numbers and sensible places, in our axes."""
     valid = torch.stack(
         [part.flatten(1).isfinite().all(1) if part.ndim > 1 else part.isfinite() for part in vars(scene).values()]
     )

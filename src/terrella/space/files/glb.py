@@ -1,7 +1,5 @@
 """GLB (binary glTF 2.0): meshes with vertex colours, and Gaussians as KHR_gaussian_splatting has them.
-
-glTF is right-handed, in metres, y up, and looks along -z: our x forward, y left, z up becomes (-y, z, -x), the axes "rub".
-"""
+glTF is right-handed, in metres, y up, and looks along -z: our x forward, y left, z up becomes (-y, z, -x), the axes "rub"."""
 
 import json
 import struct

@@ -22,9 +22,8 @@ _AXES = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])  # a point of glTF [3] t
 
 @dataclass(frozen=True)
 class Material:
-    """colour, red green blue opacity, and glow, red green blue, linear; picture uint8 [h, w, 4] as screens have it, its u v scaled
-    and moved by `placed`; unlit: its colours hold their light; see_through: opacity counts; cut: what is less opaque is not
-    there."""
+    """colour (red, green, blue, opacity) and glow (red, green, blue), linear; picture uint8 [h, w, 4], sRGB; placed: scale and
+    offset of its u v; unlit: colours include light; see_through: opacity counts; cut: what is less opaque is invisible."""
 
     colour: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     glow: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -37,8 +36,8 @@ class Material:
 
 @dataclass(frozen=True)
 class Light:
-    """place [3] and towards [3], world frame; power, red green blue: candela (point, spot) or lux (directional); cosines of the
-    inner and the outer edge of a spot."""
+    """place [3] and direction `towards` [3], world frame; power: red, green, blue in candela (point, spot) or lux (directional);
+    cone: cosines of a spot's inner and outer angle."""
 
     kind: str
     place: np.ndarray
@@ -49,8 +48,8 @@ class Light:
 
 @dataclass(frozen=True)
 class GltfScene:
-    """corners float32 [F, 3, 9] of triangles: x y z (world frame, metres), tint red green blue opacity (linear), u v; materials and
-    things, int32 [F]: which of `materials`, and which of `names` (1, 2, ...) each is of."""
+    """corners float32 [F, 3, 9] of triangles: x y z (world frame, metres), tint red green blue opacity (linear), u v; int32 [F]:
+    the index in `materials` of each, and in `names`, from 1."""
 
     corners: np.ndarray
     material: np.ndarray
@@ -61,8 +60,8 @@ class GltfScene:
 
 
 def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
-    """The triangles and lights of a .glb or .gltf, or its Gaussians (KHR_gaussian_splatting; in glTF's own frame). DatasetError
-    says what is wrong with it. Faces are counted before they are read. scale: metres of a unit of the file."""
+    """The triangles and lights of a .glb or .gltf, or its Gaussians (KHR_gaussian_splatting; in glTF's own frame). scale: metres
+    per unit of the file. DatasetError for a broken or too large file."""
     path = Path(path)
     try:
         file = open_gltf(path)

@@ -1,5 +1,4 @@
-"""SPZ, versions 1 to 4 (github.com/nianticlabs/spz): fixed-point places and a byte for nearly every other number, in gzip, or as
-streams of zstd (4)."""
+"""SPZ, versions 1 to 4 (github.com/nianticlabs/spz): fixed-point places, bytes for other numbers; gzip, or zstd streams (4)."""
 
 import gzip
 import io
@@ -41,7 +40,7 @@ def decode(data: bytes) -> Gaussians:
 
 
 def _sizes(version: int, degree: int) -> list[int]:
-    """Bytes a Gaussian of its place, opacity, colour, scales, turn and harmonics: what lies behind one another."""
+    """Bytes per Gaussian of place, opacity, colour, scales, quaternion and harmonics, in the order of the file."""
     return [6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * _SH_WIDTH[degree]]
 
 
@@ -74,7 +73,7 @@ def _unzipped(data: bytes) -> tuple[int, int, int, int, bytes]:
 
 
 def _streams(data: bytes) -> tuple[int, int, int, int, bytes]:
-    """The same of version 4: a table of streams, each compressed by itself. What lies before the table, extensions, is not read."""
+    """The same for version 4: a table of streams, each compressed. Extensions before the table are ignored."""
     version, count, degree, fraction = _about(data, (4,))
     sizes = [count * size for size in _sizes(version, degree) if size]
     if len(data) < _HEAD_4.size:
@@ -96,7 +95,7 @@ def _streams(data: bytes) -> tuple[int, int, int, int, bytes]:
 
 
 def _unpacked(data: bytes, size: int) -> bytes:
-    """`size` bytes of a stream of zstd, piece by piece, so that memory follows what is really there."""
+    """`size` bytes of a zstd stream, in pieces, so that a false size takes no memory."""
     parts = []
     try:
         with pa.CompressedInputStream(pa.BufferReader(data), "zstd") as stream:

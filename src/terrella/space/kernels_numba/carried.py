@@ -52,8 +52,7 @@ def carry(rgb, depth, turn, position, known, seen, target_turn, target_position,
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def splat(depth, things, turn, position, target_turn, target_position, flat, canvas, camera):
     """The first half of reproject.carry_things_slowly for one frame: depth and things [H, W] from its turn [3, 3] and position
-    [3]; fills flat [H, W], the depth with that of things averaged over their surroundings, and lowers `canvas` [H, W] to what is
-    seen of it from the target's."""
+    [3]. Fills flat [H, W], the depth with that of things averaged, and lowers `canvas` [H, W] to its splat in the target view."""
     height, width = depth.shape
     sums, counts = np.zeros((height + 1, width + 1)), np.zeros((height + 1, width + 1))  # of all above and to the left
     for v in range(height):

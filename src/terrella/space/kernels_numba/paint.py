@@ -12,9 +12,8 @@ TOUCHED = 0.1  # of a pixel that a billboard covers, above which it is the billb
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def paint(picture, sides, far, number, hides, rgb, depth, instances):
-    """Paints a billboard's picture [4, h, w] that fills the box `sides` (left, right, top, bottom, in pixels), `far` metres
-    ahead, into rgb [3, H, W], depth [H, W] and instances [H, W] where what `hides` it [H, W] is farther. A pixel is the mean of
-    four places in it: edges are as soft as a game's."""
+    """Paints a picture [4, h, w] into the box `sides` (left, right, top, bottom, in pixels), `far` metres ahead, of rgb [3, H, W],
+    depth [H, W] and instances [H, W] where `hides` [H, W] is farther; a pixel is the mean of four places, for soft edges."""
     left, right, top, bottom = sides
     height, width = depth.shape
     _, rows, columns = picture.shape

@@ -1,9 +1,8 @@
-"""Splats: Gaussians seen by a camera as ellipses of an image, and the way back of their gradients (raster/rasterise.py).
+"""Splats: Gaussians as ellipses in the image, and the gradients backward (raster/rasterise.py). EWA splatting (Zwicker et al.
+2001) as in 3D Gaussian Splatting (Kerbl et al. 2023). Camera x forward, y left, z up.
 
 A splat is a row of float32: column, row (pixels), A, B, C (the exponent at an offset (x, y) is A x^2 + B x y + C y^2), opacity, the
-largest exponent that is still drawn, red, green, blue, depth, half extents along columns and rows, 3 unused.
-EWA splatting (Zwicker et al. 2001) as in 3D Gaussian Splatting (Kerbl et al. 2023). Camera x forward, y left, z up.
-"""
+largest exponent that is still drawn, red, green, blue, depth, half extents along columns and rows, 3 unused."""
 
 import math
 
@@ -72,9 +71,8 @@ def _out_of_sight(d, e, h, reach, lens, panorama, near):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def project(first, last, means, quats, scales, opacities, sh, place, rot, lens, panorama, near, splats, which, depths):
-    """Writes the splats of the Gaussians `first` to `last` that are in sight, from row `first` on, and which they
-    are; how many. means [N, 3], quats [N, 4] wxyz, scales [N, 3] metres, opacities [N], sh [N, K, 3]; place [3] and rot [3, 3]
-    of the camera."""
+    """Writes the visible splats of the Gaussians `first` to `last` from row `first` on, and their indices; returns their number.
+    means [N, 3], quats [N, 4] wxyz, scales [N, 3] metres, opacities [N], sh [N, K, 3]; place [3] and rot [3, 3] of the camera."""
     count, many = first, sh.shape[1]
     y = np.empty(16, np.float32)
     for n in range(first, last):

@@ -1,5 +1,4 @@
-"""Tiles: splats (splats.py) sorted by depth and shared out over tiles of 16 by 16 pixels; a tile is painted row by row, so that one
-row is one vector of a processor."""
+"""Tiles: splats (splats.py) sorted by depth and assigned to tiles of 16 by 16 pixels, a row of which is one SIMD vector."""
 
 import math
 
@@ -180,11 +179,8 @@ def _spent(planes, tall, wide):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def paint_back(first, step, splats, starts, items, ends, around, picture, g_picture, grads):
-    """The gradients of what `paint_tiles` painted: g_picture [5, H, W] -> added to grads [V, 10]: of column, row, A, B, C, opacity,
-    red, green, blue, depth.
-
-    From front to back: what lies behind a splat is the whole less what lies before it.
-    """
+    """The gradients of `paint_tiles`, from front to back: g_picture [5, H, W] -> added to grads [V, 10]: of column, row, A, B, C,
+    opacity, red, green, blue, depth."""
     _, height, width = picture.shape
     across = (width + TILE - 1) // TILE
     planes, columns = np.empty((TILE, 6 * TILE), np.float32), np.empty(TILE, np.float32)

@@ -10,9 +10,8 @@ WITHIN_M = 0.005  # as well as walls are known
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def straight_runs(inverse, runs, left, fewest, straight, gap, least):
-    """The kernel of floorplan.straight_runs_slowly for one row: fills runs [n, 4] = first, stop, slope, level of runs of columns
-    on which the inverse depth [w] is a line of `left` [w], as far as neighbours are less than `gap` metres apart and no inverse
-    depth is below `least`."""
+    """The kernel of floorplan.straight_runs_slowly for one row: fills runs [n, 4] = first, stop, slope, level of columns whose
+    inverse depth [w] is linear in `left` [w], with neighbours less than `gap` metres apart and no inverse depth below `least`."""
     count, first = 0, 0
     while first < len(inverse):
         stop = first + 1
@@ -75,9 +74,9 @@ def gather_near(walls, x, y, reach, close, count):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def first_touch(walls, x, y, mx, my, half):
-    """At which share of the move mx, my a box around x, y first touches one of `walls` [S, 4] (2 where none), and the
-    direction along which it may go on. By separating axes. Walls are known to WITHIN_M: one that the box is deeper in does
-    not hold it, and one that it would only graze by less does not stop it."""
+    """The share of the move mx, my at which a box around x, y first touches one of `walls` [S, 4] (2: none), by separating axes,
+    and the direction in which it can go on. A wall in which the box already is deeper than WITHIN_M, or that it only grazes, is
+    ignored."""
     best, along_x, along_y = 2.0, 0.0, 0.0
     unit = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
     low, high, speed = np.empty(3), np.empty(3), np.empty(3)

@@ -1,7 +1,5 @@
-"""Blocks as flat Gaussians in a grid on every visible side, lit by radiosity (Goral et al. 1984).
-
-A light map of texels gathers the light of lamps, windows and the sun, and of three bounces between texels.
-"""
+"""Blocks as flat Gaussians in a grid on every visible side, lit by radiosity (Goral et al. 1984): a light map of texels gathers the
+light of lamps, windows and the sun, and of three bounces between texels."""
 
 import math
 from dataclasses import dataclass

@@ -12,9 +12,8 @@ _WIDEST = 1 << 18  # cells along an axis
 
 
 def solids_of(corners: np.ndarray, things: np.ndarray) -> np.ndarray | None:
-    """Boxes float32 [S, 6], low and high corners, of triangles [F, 3, 3] (metres) of the objects `things` [F]. An object that is a
-    box is filled, unless others lie in it (a room); the other triangles are boxed in each cell of CELL_M. None for more than
-    MOST boxes."""
+    """Boxes float32 [S, 6], low and high corners, of triangles [F, 3, 3] (metres) of the objects `things` [F]: whole objects that
+    are boxes without others in them, else the triangles in each cell of CELL_M. None for more than MOST boxes."""
     order = np.argsort(things, kind="stable")
     ends = np.flatnonzero(np.diff(things[order], prepend=-1, append=-1))
     groups = [order[a:b] for a, b in zip(ends, ends[1:])]

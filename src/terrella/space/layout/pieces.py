@@ -4,11 +4,8 @@ import numpy as np
 
 
 def pieces(corners: np.ndarray, count: int, finest_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Splits triangles until there are `count`, or until no edge is longer than `finest_m`, the longest edges first.
-
-    corners [F, 3, k]: the first three numbers are a point (metres); all k are interpolated along edges. Returns the corners of
-    the pieces, and the triangle that each belongs to.
-    """
+    """Splits triangles, the longest edges first, until there are `count`, or no edge is longer than `finest_m`. corners [F, 3, k]:
+    a point (metres) and values to be interpolated. Returns the corners of the pieces, and the triangle of each."""
     corners, face = corners.copy(), np.arange(len(corners))
     while len(corners) < count:
         edges = np.linalg.norm(corners[:, [1, 2, 0], :3] - corners[:, :, :3], axis=2)

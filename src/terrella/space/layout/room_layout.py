@@ -1,7 +1,5 @@
-"""The layout of a place, as in a layout.json: rooms, doors, windows, stairs, things. It is checked before anything is built.
-
-World frame, metres: x east, y north, z up. Walls are 0.1 m thick and lie outside a room's own space.
-"""
+"""The layout of a place, as in a layout.json: rooms, doors, windows, stairs, things; checked before anything is built. World frame,
+metres: x east, y north, z up. Walls are 0.1 m thick and lie outside a room's own space."""
 
 from __future__ import annotations  # `_value` reads annotations as text
 

@@ -1,9 +1,8 @@
 """Parses words into a layout: "a long room with two pillars and a red door". A small grammar, no language model; see docs/space.md.
+Rooms follow one another to the east, joined by doors. Unknown words are reported.
 
     text    = room { room };  room = { size | look } NOUN { thing | surface };  thing = [number] { size | look } NOUN { place }
     surface = { look } ("floor" | "walls" | "ceiling");  place = ("on" | "in" | "at" | "by") ... SIDE
-
-Rooms follow one another to the east, joined by doors. Unknown words are reported.
 """
 
 import re

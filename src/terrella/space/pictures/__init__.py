@@ -15,8 +15,7 @@ LONGEST = 1600  # pixels of pictures whose poses are looked for
 
 
 def is_pictures(path: Path) -> bool:
-    """Whether a path is a video, or a folder of pictures, with poses or without; a recording, which may hold a picture beside its
-    data, is none."""
+    """Whether a path is a video or a folder of pictures, posed or not, and not a recording."""
     if path.is_file():
         return path.suffix.lower() in VIDEOS or path.name == transforms.FILE
     recorded = (path / "meta" / "info.json").exists()
@@ -28,8 +27,8 @@ def is_pictures(path: Path) -> bool:
 
 
 def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str]]:
-    """Pictures with their poses, `frames` of them at most, and what was left out. Where no poses are there COLMAP finds them, and
-    leaves pictures and model in `work`, where the next call reads them."""
+    """At most `frames` pictures with poses, and the names of those left out. Missing poses are computed by COLMAP; pictures and
+    model stay in `work` for the next call."""
     if path.name == transforms.FILE or (path / transforms.FILE).exists():
         shots, out = transforms.read_transforms(path), []
     elif path.is_dir() and colmap.model_of(path) is not None:

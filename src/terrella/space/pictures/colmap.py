@@ -66,8 +66,8 @@ def _lens(camera: Any) -> Lens:
 
 
 def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
-    """Finds poses and points of FOLDER/images and writes FOLDER/sparse/0; how many pictures were placed. `film`: they follow one
-    another; `alike`: they are of one camera. DatasetError where they do not fit together."""
+    """Computes poses and points of FOLDER/images into FOLDER/sparse/0; returns the number of posed pictures. film: they are
+    consecutive; alike: they have one camera. DatasetError where they do not fit together."""
     colmap = _pycolmap()
     colmap.set_random_seed(seed)
     images, database, work = folder / "images", folder / "database.db", folder / "work"

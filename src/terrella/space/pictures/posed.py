@@ -22,8 +22,8 @@ MIDDLE_M = 3.0  # how far away the middle point lies where nothing says how long
 
 @dataclass(frozen=True)
 class Lens:
-    """width and height in pixels; focal: fx, fy, cx, cy in pixels; `pixels` maps tangents [N, 2] (right and down of the optical
-    axis) to pixels [N, 2], with its distortion."""
+    """width and height in pixels; focal: fx, fy, cx, cy in pixels; `pixels`: from tangents [N, 2] (right and down of the optical
+    axis) to pixels [N, 2], with distortion."""
 
     width: int
     height: int
@@ -48,8 +48,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Shots:
-    """files and lenses of pictures; pose [T, 7] (ours); points float32 [N, 3] that are known to be there; metric: whether its unit
-    is said to be a metre."""
+    """files and lenses of pictures; pose [T, 7], our frame; known points float32 [N, 3]; metric: whether the unit is a metre."""
 
     files: list[Path]
     lenses: list[Lens]
@@ -87,8 +86,8 @@ def levelled(shots: Shots) -> Shots:
 
 
 def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:
-    """The pictures as one pinhole camera would have taken them, `longest` pixels at most a side, without depth; and the names
-    of those that were left out because they are blurred."""
+    """The pictures as one pinhole camera sees them, at most `longest` pixels a side, without depth; and the names of blurred ones
+    that were left out."""
     if len(shots.files) < FEWEST:
         raise DatasetError(f"there are {len(shots.files)} posed pictures, and a fit needs {FEWEST} or more; take more.")
     boxes = np.stack([lens.extent() for lens in set(shots.lenses)])

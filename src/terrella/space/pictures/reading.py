@@ -15,8 +15,8 @@ BLURRED = 0.4  # of the usual sharpness of a set: less is left out
 
 
 def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.ndarray:
-    """uint8 [H, W, 3], made smaller where a side is above `longest`; `upright`: turned as its EXIF data say. DatasetError for what
-    is no picture, a tiny or a huge one."""
+    """uint8 [H, W, 3], reduced to at most `longest` pixels a side; `upright`: turned by its EXIF orientation. DatasetError for a
+    broken, tiny or huge picture."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of damaged EXIF data, of large pictures

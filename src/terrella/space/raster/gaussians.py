@@ -14,12 +14,11 @@ Y0 = 0.28209479177387814  # the harmonic of degree 0
 
 @dataclass(frozen=True)
 class Gaussians:
-    """N Gaussians, float32 all, world frame (z up, metres).
+    """N Gaussians, float32, world frame (z up, metres).
 
-    means [N, 3]; quats [N, 4] w, x, y, z of any length; scales [N, 3] standard deviations in metres along their axes;
-    opacities [N] in 0..1; sh [N, K, 3] spherical harmonics of their colours, K = 1, 4, 9 or 16 (degree 0 to 3), of which a
-    colour is 0.5 + what they add up to in the direction from the camera, and not below 0.
-    """
+    means [N, 3]; quats [N, 4] w, x, y, z of any length; scales [N, 3] standard deviations in metres; opacities [N] in 0..1; sh [N,
+    K, 3] spherical harmonics, K = 1, 4, 9 or 16 (degree 0 to 3): a colour is 0.5 + their sum in the direction from the camera, at
+    least 0."""
 
     means: torch.Tensor
     quats: torch.Tensor

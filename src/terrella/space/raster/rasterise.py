@@ -1,8 +1,5 @@
-"""Draws Gaussians as cameras see them, on all cores, with gradients: compiled kernels behind one call.
-
-Splats are projected, sorted by depth once for the whole picture, shared out over tiles, and painted from front to back until a
-tile is opaque. slow.py is the same in plain tensor algebra.
-"""
+"""Renders Gaussians on all cores with gradients, by compiled kernels: projected, sorted by depth once for the whole picture,
+assigned to tiles, and painted from front to back until a tile is opaque. slow.py is the same in plain tensor algebra."""
 
 from typing import Any, NamedTuple
 
@@ -20,8 +17,8 @@ MOST = 1 << 24  # Gaussians of a scene: their numbers are painted as float32
 
 
 class Drawing(NamedTuple):
-    """What cameras see: rgb float32 [B, 3, H, W], black where nothing is; depth [B, H, W] metres, weighted as the colours are
-    (divide it by alpha for the mean); alpha [B, H, W] in 0..1; ids int32 [B, H, W], the Gaussian that counts most, -1 for none."""
+    """rgb float32 [B, 3, H, W], black where empty; depth [B, H, W] metres, weighted as the colours are (divide by alpha for the
+    mean); alpha [B, H, W] in 0..1; ids int32 [B, H, W], the Gaussian with the largest weight, -1 for none."""
 
     rgb: torch.Tensor
     depth: torch.Tensor
@@ -36,11 +33,9 @@ def rasterise(
     size: tuple[int, int],
     near_m: float = NEAR_M,
 ) -> Drawing:
-    """The Gaussians as seen from `pose` [B, 7] (T_world_cam) by a pinhole camera of these intrinsics, or without one in all
-    directions (equirectangular: the middle looks forward, the left edge backward; depth is then the distance); size: height, width.
-
-    Gradients flow to all parts of the Gaussians, not to the poses. ContractError for more than 2**24 Gaussians.
-    """
+    """The Gaussians from `pose` [B, 7] (T_world_cam) through a pinhole camera, or without one in all directions (equirectangular:
+    the middle is forward, the left edge backward, depth is the distance). size: height, width. Gradients flow to the Gaussians,
+    not to the poses. ContractError for more than 2**24 Gaussians."""
     if len(gaussians) >= MOST:
         raise ContractError(f"a scene has fewer than {MOST:,} Gaussians; this one has {len(gaussians):,}: thin it out.")
     parts = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh
