@@ -114,12 +114,8 @@ class GymnasiumWorld:
         rgb, options, repeat = config.rgb, dict(config.options), config.repeat
         self._env, own_name = build(env, rgb, options)
         own_name = own_name if repeat == 1 else f"{own_name}@{repeat}"
-        self._name, self._size, self._info = (
-            config.name or own_name,
-            check_size(config.size),
-            tuple(config.info_channels),
-        )
-        self._repeat = repeat
+        self._name, self._repeat = config.name or own_name, repeat
+        self._size, self._info = check_size(config.size), tuple(config.info_channels)
         check_space(self._env.action_space, self._name)
         renders = rgb and self._env.render_mode == "rgb_array"
         self._parts = parts_of(self._env.observation_space, self._name, rgb, renders)
@@ -400,7 +396,6 @@ def check_size(size: tuple[int, int] | None) -> tuple[int, int] | None:
     """The size if it is a valid picture size; else TerrellaError."""
     if size is None:
         return None
-    valid = len(size) == 2 and all(int(side) == side and 1 <= side <= 4096 for side in size)
-    if not valid:
+    if len(size) != 2 or not all(int(side) == side and 1 <= side <= 4096 for side in size):
         raise TerrellaError(f"{tuple(size)} is not a picture size: size is (height, width), 1 to 4096 each.")
     return int(size[0]), int(size[1])

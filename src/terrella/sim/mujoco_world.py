@@ -92,9 +92,8 @@ class MujocoWorld:
         spec = complete(read(label) if robot is None else robot.spec(label), label)
         self._source, self._seen = spec, compiled(spec, label)
         self.file = bare(spec, self._seen, label)
-        self.file.opt.disableflags |= (
-            mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        )  # otherwise an unstable simulation would restart without a warning
+        # otherwise an unstable simulation would restart without a warning
+        self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.name = f"mujoco:{label}"
         self._steps = max(1, round((config.control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
         self._threads, self._device = config.threads or _cores(), config.device
@@ -397,17 +396,8 @@ def _layout(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: i
     hinges = torch.from_numpy(model.jnt_qposadr[own]).long(), torch.from_numpy(model.jnt_dofadr[own]).long()
     plain = (torch.from_numpy(np.asarray(part, np.float64)) for part in (home[0], rest, low, high))
     at_home, at_rest, lowest, highest = plain
-    return RobotLayout(
-        slice(1, ends[0]),
-        slice(*ends),
-        hinges,
-        at_home,
-        at_rest,
-        lowest,
-        highest,
-        sensors,
-        steps * float(model.opt.timestep),
-    )
+    step_s = steps * float(model.opt.timestep)
+    return RobotLayout(slice(1, ends[0]), slice(*ends), hinges, at_home, at_rest, lowest, highest, sensors, step_s)
 
 
 def _cameras(model: mujoco.MjModel, wanted: Sequence[str] | None) -> list[str]:

@@ -48,10 +48,8 @@ def rotation(pose: torch.Tensor) -> torch.Tensor:
 
 def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
     """Depth [..., H, W] seen from `pose` [..., 7] -> world points [..., H, W, 3]."""
-    directions = rays(camera, *depth.shape[-2:], device=depth.device)
-    points = depth[..., None] * directions
-    turned = points.flatten(-3, -2) @ rotation(pose).mT
-    return (turned + pose[..., None, :3]).view(points.shape)
+    points = depth[..., None] * rays(camera, *depth.shape[-2:], device=depth.device)
+    return (points.flatten(-3, -2) @ rotation(pose).mT + pose[..., None, :3]).view(points.shape)
 
 
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:

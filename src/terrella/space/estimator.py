@@ -78,8 +78,7 @@ class Estimator(nn.Module):
 
     def strangeness(self, rgb: torch.Tensor) -> torch.Tensor:
         """How unlike the pictures that it learned from (Mahalanobis distance of looks): [B], below 1 for _USUAL of those."""
-        white = (self.looks(rgb) - self.usual) @ self.spread
-        return white.norm(dim=1) / self.reach
+        return ((self.looks(rgb) - self.usual) @ self.spread).norm(dim=1) / self.reach
 
     # -- inside, and for training: pictures are float [B, 3, *size] in 0..1, or the same `normalise` --------------
 
@@ -105,8 +104,7 @@ class Estimator(nn.Module):
         """Takes looks [N, D] for usual."""
         values = looks.double()
         mean = values.mean(0)
-        width = values.shape[1]
-        covariance = torch.cov(values.T) + 1e-6 * torch.eye(width) + 0.01 * torch.diag(values.var(0))
+        covariance = torch.cov(values.T) + 1e-6 * torch.eye(values.shape[1]) + 0.01 * torch.diag(values.var(0))
         scales, axes = torch.linalg.eigh(covariance)
         spread = axes / scales.sqrt()
         self.usual.copy_(mean)

@@ -116,8 +116,7 @@ def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     if not long.any():
         return torch.zeros(0, 4)
     start, end, origin = start[long], end[long], origin[long]
-    away = ((start + end) / 2 - origin).norm(dim=1).clamp_min(0.5)
-    weight = (end - start).norm(dim=1) / away**2
+    weight = (end - start).norm(dim=1) / ((start + end) / 2 - origin).norm(dim=1).clamp_min(0.5) ** 2
     for _ in range(2):
         parts = [_mean_line(start[some], end[some], start, end, weight) for some in torch.arange(len(start)).split(512)]
         start, end = (torch.cat(halves) for halves in zip(*parts))
@@ -238,5 +237,4 @@ def sees_into(
     x0, y0, x1, y1 = box
     flat = (camera[0], camera[1], camera[2], 0.5)  # of a picture of that row only
     x, y = unproject(level[:, None], pose, flat)[:, 0, :, :2].unbind(-1)
-    inside = (x > x0 + deep_m) & (x < x1 - deep_m) & (y > y0 + deep_m) & (y < y1 - deep_m)
-    return inside.any(1)
+    return ((x > x0 + deep_m) & (x < x1 - deep_m) & (y > y0 + deep_m) & (y < y1 - deep_m)).any(1)

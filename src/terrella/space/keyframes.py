@@ -51,10 +51,8 @@ class Keyframes:
         """No keyframes, of pictures of `size`."""
         shapes = {"rgb": (3, *size), "depth": size, "pose": (7,), "turn": (3, 3), "walls": (WALLS, 4)}
         shapes |= {name: (patch_count(size, stride), 9) for name, stride in (("coarse", COARSE), ("fine", FINE))}
-        kinds = {"rgb": torch.uint8}
-        return Keyframes(
-            **{name: torch.zeros(0, *shape, dtype=kinds.get(name), device=device) for name, shape in shapes.items()}
-        )
+        parts = {name: torch.zeros(0, *shape, device=device) for name, shape in shapes.items()}
+        return Keyframes(**{**parts, "rgb": parts["rgb"].byte()})
 
     @staticmethod
     def joined(parts: Sequence[Keyframes]) -> Keyframes:

@@ -94,8 +94,7 @@ class RigidBodies:
     def _stepped(self, poses, speeds, eye, goal) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         batch, count, model = len(poses), self.count, self._model
         wish = (goal - eye) / self.dt_s
-        turns = rotation(poses)
-        spin = (turns.mT @ speeds[..., 3:, None])[..., 0]  # MuJoCo has it in the body's own frame
+        spin = (rotation(poses).mT @ speeds[..., 3:, None])[..., 0]  # MuJoCo has it in the body's own frame
         moving = torch.cat([speeds[..., :3], spin], 2).flatten(1)
         first = torch.cat([torch.zeros(batch, 1), poses.flatten(1), eye, moving, wish], 1).double().numpy()
         control = np.repeat(wish[:, None, :2].double().numpy(), self.steps, 1)

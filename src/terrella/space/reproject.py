@@ -14,8 +14,7 @@ def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, si
     """World points [B, N, 3] -> nearest depth for each pixel of the view from `pose` [B, 7]: [B, H, W], FAR_M in holes."""
     height, width = size
     where, depth = project(points, pose, camera)
-    column = (where[..., 0] * width).floor().long()
-    row = (where[..., 1] * height).floor().long()
+    column, row = (where[..., 0] * width).floor().long(), (where[..., 1] * height).floor().long()
     seen = (depth > 0.05) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = torch.where(seen, row * width + column, height * width)  # the last cell collects what is out of view
     canvas = depth.new_full((len(points), height * width + 1), FAR_M)

@@ -21,7 +21,7 @@ def encode_mesh(mesh: Mesh, name: str) -> bytes:
     colours = np.concatenate([linear, np.ones((len(linear), 1))], 1).astype(np.float32)
     parts = {"POSITION": mesh.vertices.numpy().astype(np.float32), "COLOR_0": colours}
     plain = {"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}, "doubleSided": True}
-    shown = {**plain, "extensions": {"KHR_materials_unlit": {}}}  # light is in the colours
+    shown = {**plain, "extensions": {"KHR_materials_unlit": {}}}  # colours include light
     doc = {"materials": [shown], "extensionsUsed": ["KHR_materials_unlit"]}
     return _glb(doc, parts, {"mode": 4, "material": 0}, name, mesh.faces.numpy().astype(np.uint32).reshape(-1))
 

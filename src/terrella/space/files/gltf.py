@@ -91,17 +91,13 @@ class Gltf:
 
 def open_gltf(path: Path) -> Gltf:
     """The file without its meshes unpacked; ValueError or KeyError for what is broken, cut short or compressed."""
-    data, body = path.read_bytes(), b""
-    if data[:4] == GLTF:
-        text, body = _chunks(data)
-    else:
-        text = data
+    data = path.read_bytes()
+    text, body = _chunks(data) if data[:4] == GLTF else (data, b"")
     about = json.loads(text)
     if not isinstance(about, dict) or not str(about.get("asset", {}).get("version", "")).startswith("2."):
         raise ValueError("it is no glTF of version 2")
     needed = about.get("extensionsRequired", [])
-    packed = [name for name in _COMPRESSED if name in needed]
-    if packed:
+    if packed := [name for name in _COMPRESSED if name in needed]:
         raise ValueError(f"its meshes are compressed ({packed[0]}), which is not read: export it without compression")
     unknown = sorted(set(map(str, needed)) - _KNOWN)
     if unknown:

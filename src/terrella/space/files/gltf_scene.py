@@ -137,11 +137,8 @@ def _scene(file: Gltf, nodes: list, parts: list) -> GltfScene:
     for node, matrix, part in parts:
         one = _triangles(file, matrix, part)
         if id(node) not in numbers:
-            names.append(
-                str(node.get("name") or file.named("meshes", node["mesh"]).get("name") or f"thing {len(names) + 1}")[
-                    :80
-                ]
-            )
+            name = node.get("name") or file.named("meshes", node["mesh"]).get("name") or f"thing {len(names) + 1}"
+            names.append(str(name)[:80])
             numbers[id(node)] = len(names)
         corners.append(one)
         material.append(np.full(len(one), part.get("material", -1), np.int32))
@@ -154,10 +151,8 @@ def _scene(file: Gltf, nodes: list, parts: list) -> GltfScene:
     used, which = np.unique(which, return_inverse=True)
     pictures: dict[int, np.ndarray] = {}
     looks = tuple(_material(file, abouts[k] if k >= 0 else {}, pictures) for k in used.tolist())
-    lights = _lights(file, nodes)
-    return GltfScene(
-        np.concatenate(corners), which.astype(np.int32), np.concatenate(things), looks, tuple(names), lights
-    )
+    tables = np.concatenate(corners), which.astype(np.int32), np.concatenate(things)
+    return GltfScene(*tables, looks, tuple(names), _lights(file, nodes))
 
 
 def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarray:
@@ -181,9 +176,8 @@ def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarr
     index = index[: len(index) // 3 * 3].reshape(-1, 3)
     corners = rows[index[:, [0, 2, 1]] if np.linalg.det(matrix[:3, :3]) < 0 else index]
     with np.errstate(over="ignore", invalid="ignore"):
-        area = np.linalg.norm(
-            np.cross(corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]), axis=1
-        )
+        first, second = corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]
+        area = np.linalg.norm(np.cross(first, second), axis=1)
     return corners[np.isfinite(corners).all((1, 2)) & np.isfinite(area) & (area > 1e-12)]
 
 
@@ -223,8 +217,8 @@ def _lights(file: Gltf, nodes: list) -> tuple[Light, ...]:
         if about.get("type") not in ("point", "spot", "directional") or not np.isfinite(power).all():
             raise ValueError("one of its lights is none")
         cone = float(np.cos(edges[0])), float(np.cos(edges[1]))
-        length = max(float(np.linalg.norm(towards)), 1e-9)
-        lights.append(Light(about["type"], matrix[:3, 3] @ _AXES, towards / length, power, cone))
+        towards = towards / max(float(np.linalg.norm(towards)), 1e-9)
+        lights.append(Light(about["type"], matrix[:3, 3] @ _AXES, towards, power, cone))
     return tuple(lights[:MOST_LIGHTS])
 
 

@@ -53,10 +53,8 @@ def decode(elements: dict[str, np.ndarray]) -> Gaussians:
     if "scale_0" not in (rows.dtype.names or ()):
         colours = columns(rows, "red", "green", "blue") / 255
         spread = (means.amax(0) - means.amin(0)).norm() / max(len(rows), 1) ** 0.5
-        scales, quats = (
-            torch.full((len(rows), 3), float(spread) * 0.4),
-            torch.tensor([[1.0, 0, 0, 0]]).repeat(len(rows), 1),
-        )
+        scales = torch.full((len(rows), 3), float(spread) * 0.4)
+        quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(rows), 1)
         return Gaussians(means, quats, scales, torch.full((len(rows),), 0.9), plain_sh(colours))
     rest = [name for name in rows.dtype.names or () if name.startswith("f_rest_")]
     many = {0: 1, 9: 4, 24: 9, 45: 16}.get(len(rest))

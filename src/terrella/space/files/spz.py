@@ -134,8 +134,7 @@ def _smallest_three(part: np.ndarray) -> torch.Tensor:
         value = (packed & 511) / 511 * 0.5**0.5 * np.where(packed & 512, -1, 1)
         quats[here, axis] = value[here]
         packed = np.where(here, packed >> 10, packed)
-    rest = np.sqrt(np.maximum(1 - (quats**2).sum(1), 0))
-    quats[np.arange(len(quats)), which] = rest
+    quats[np.arange(len(quats)), which] = np.sqrt(np.maximum(1 - (quats**2).sum(1), 0))
     return torch.from_numpy(quats[:, [3, 0, 1, 2]])
 
 

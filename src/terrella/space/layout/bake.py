@@ -226,10 +226,8 @@ def _brightness(plan, blocks, boxes, cells, texels, bare, light) -> np.ndarray:
             u, v = v, u
         own[rows] = texture_colours(blocks.looks[k], u, v, float(cells.widths[first].max()), plan.seed + 31 * int(axis))
     falls = _between(cells, texels, bare, light, boxes)
-    points = cells.points + 0.003 * cells.normals
-    sun = _sun(plan, blocks, boxes, points, cells.normals)
-    coarse = _between(cells, texels, bare, _texel_sun(plan, blocks, boxes, texels), boxes)
-    falls = np.maximum(falls - coarse, 0) + sun
+    coarse = _between(cells, texels, bare, _sun_on(plan, blocks, boxes, texels), boxes)
+    falls = np.maximum(falls - coarse, 0) + _sun_on(plan, blocks, boxes, cells)
     return exposed(own, falls, glow > 0)
 
 
@@ -245,8 +243,8 @@ def exposed(own: np.ndarray, falls: np.ndarray, shines: np.ndarray) -> np.ndarra
     return pictured
 
 
-def _texel_sun(plan, blocks, boxes, texels) -> np.ndarray:
-    return _sun(plan, blocks, boxes, texels.points + 0.003 * texels.normals, texels.normals)
+def _sun_on(plan, blocks, boxes, grid) -> np.ndarray:
+    return _sun(plan, blocks, boxes, grid.points + 0.003 * grid.normals, grid.normals)
 
 
 def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, boxes: np.ndarray) -> np.ndarray:
@@ -283,8 +281,7 @@ def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, 
 def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:
     count = len(cells.points)
     scales = np.full((count, 3), THIN_M)
-    rows = np.arange(count)[:, None]
-    scales[rows, np.array(_AXES)[cells.sides // 2]] = OVERLAP * cells.widths
+    scales[np.arange(count)[:, None], np.array(_AXES)[cells.sides // 2]] = OVERLAP * cells.widths
     means = cells.points - THIN_M * cells.normals
     to = lambda part: torch.from_numpy(np.ascontiguousarray(part, np.float32))  # noqa: E731
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)

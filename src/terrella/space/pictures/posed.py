@@ -57,9 +57,8 @@ class Shots:
     metric: bool
 
     def at(self, rows: list[int]) -> Shots:
-        return Shots(
-            [self.files[k] for k in rows], [self.lenses[k] for k in rows], self.pose[rows], self.points, self.metric
-        )
+        files, lenses = [self.files[k] for k in rows], [self.lenses[k] for k in rows]
+        return Shots(files, lenses, self.pose[rows], self.points, self.metric)
 
 
 def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:

@@ -62,9 +62,7 @@ def join(parts: Sequence[Gaussians]) -> Gaussians:
         replace(part, sh=torch.cat([part.sh, part.sh.new_zeros(len(part), many - part.sh.shape[1], 3)], 1))
         for part in parts
     ]
-    return Gaussians(
-        **{field.name: torch.cat([getattr(part, field.name) for part in whole]) for field in fields(Gaussians)}
-    )
+    return Gaussians(*(torch.cat([getattr(part, field.name) for part in whole]) for field in fields(Gaussians)))
 
 
 def plain_sh(colours: torch.Tensor) -> torch.Tensor:

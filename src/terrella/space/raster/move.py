@@ -40,8 +40,7 @@ def quaternion_of(rot: torch.Tensor) -> torch.Tensor:
     """The quaternion [4] w, x, y, z of a rotation matrix, by the largest of its squares (Shepperd 1978)."""
     m = rot.double()
     t = m.trace()
-    squares = torch.stack([t, *m.diagonal()])
-    k = int(squares.argmax())
+    k = int(torch.stack([t, *m.diagonal()]).argmax())
     if k == 0:
         q = [1 + t, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
     else:
