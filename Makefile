@@ -91,4 +91,6 @@ $(VENV)/.ready-play: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.ready-dev: $(VENV)/.ready-play
 	@$(PIP) -q -e '.[dev]'
+	@echo "compiling the kernels that the tests call, so that the first run need not"
+	@$(RUN_TESTS) -q -m "not slow" $(addprefix tests/space/test_,kernels.py mosaic.py raster.py walkable.py) >/dev/null || true
 	@touch $@
