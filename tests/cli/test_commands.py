@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from tests.cli.tiny import FAILS
 from tests.worlds.made import place
 
@@ -18,7 +19,10 @@ import terrella
 from terrella.care import doctor
 from terrella.cli import COMMANDS, main
 from terrella.core import make_rng
+from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
+from terrella.workflows.acceleration import AccelerationConfig, measure_acceleration
+from terrella.workflows.export_space import _eased
 from terrella.worlds.controls import CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
 
@@ -410,3 +414,20 @@ def test_warnings_are_sentences_without_our_source(monkeypatch, capsys):
     before = warnings.formatwarning
     assert main([]) == 0 and capsys.readouterr().out.strip() == "terrella: so it is."
     assert warnings.formatwarning is before
+
+
+@pytest.mark.parametrize("name", ["doom-maze", "doom:my_way_home", "gym:ALE/Pong-v5"])
+def test_a_world_that_always_draws_is_not_recorded_without_pictures(name, tmp_path, capsys):
+    assert main(["record", "world", name, "--pictures", "none", "--frames", "10", "--out", str(tmp_path / "set")]) != 0
+    assert "always draws its pictures" in capsys.readouterr().err
+
+
+def test_a_throughput_needs_a_batch():
+    with pytest.raises(TerrellaError, match="--batches"):
+        measure_acceleration("doom-maze", AccelerationConfig(batches=()))
+
+
+def test_a_film_passes_thousands_of_stations():
+    stations = torch.rand(3000, 4)
+    poses = _eased(stations, 6001)
+    assert torch.allclose(poses[[0, -1], :3], stations[[0, -1], :3])

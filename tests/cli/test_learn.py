@@ -69,6 +69,7 @@ def test_more_minutes_train_a_finished_world_on(tmp_path):
     for stage in (RECORDING, TRAINING, SCORING):
         plan.note(stage, {})
     assert set(LearnSchedule(tmp_path / "a", {}, 2).facts) == {RECORDING, TRAINING, SCORING}
+    assert LearnSchedule(tmp_path / "a", {}, 2).minutes == 3, "more than three are needed to train it further"
     assert set(LearnSchedule(tmp_path / "a", {}, 5).facts) == {RECORDING}
 
 

@@ -104,7 +104,7 @@ def measure_acceleration(
     """Times a world with a new random action at each control step, beside a simulator of the same task in the same run: imagined
     seconds per second, joules, the usable horizon, and the return that a policy trained in the world retains."""
     config = config or AccelerationConfig()
-    if min(*config.batches, config.turns, config.episodes) < 1 or not config.seconds > 0:
+    if not config.batches or min(*config.batches, config.turns, config.episodes) < 1 or not config.seconds > 0:
         raise TerrellaError("--batches, --turns and --episodes are 1 or more, and --seconds is above 0.")
     if (config.agent is None) != (config.reference is None) or (config.agent and not config.beside):
         raise TerrellaError("the return retained needs all three: --agent, --reference and --beside.")

@@ -151,8 +151,8 @@ def _stations(world: SplatWorld, path: Path | None) -> torch.Tensor:
 
 def _eased(stations: torch.Tensor, count: int) -> torch.Tensor:
     """`count` poses from the first station to the last, easing in and out of each."""
-    at = torch.linspace(0, len(stations) - 1, count).clamp_max(len(stations) - 1 - 1e-4)
-    first = at.long()
+    at = torch.linspace(0, len(stations) - 1, count)
+    first = at.long().clamp_max(len(stations) - 2)
     share = at - first
     share = (share * share * (3 - 2 * share))[:, None]
     turn = (stations[1:, 3] - stations[:-1, 3] + math.pi) % (2 * math.pi) - math.pi

@@ -90,7 +90,7 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     settings |= asdict(config.environment) | asdict(config.controls)
     schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes)
     if SCORING in schedule.facts:
-        progress(f"{schedule.folder} is finished; --minutes with more than {config.minutes:g} trains it on.")
+        progress(f"{schedule.folder} is finished; --minutes with more than {schedule.minutes:g} trains it further.")
     else:
         _Learning(environment, config, schedule, progress).run()
     score = schedule.facts[SCORING]

@@ -43,12 +43,13 @@ class LearnSchedule:
     """The stages of a folder with `recording`, `run` and `score`; the file learn.json keeps the settings and what is done.
 
     settings: JSON values, which must not change once something is recorded.
-    minutes:  for all stages and all runs of the command together.
+    minutes:  for all stages and all runs of the command together; the most that any run was given.
     facts:    what is known of the stages that are over, by their names.
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any], minutes: float):
         self.folder, self.settings, self.seconds = folder, json.loads(json.dumps(settings)), 60 * minutes
+        self.minutes = minutes
         self.spent: dict[str, float] = dict.fromkeys((RECORDING, TRAINING, SCORING), 0.0)
         self.facts: dict[str, Any] = {}
         self._file, self._began = folder / "learn.json", time.monotonic()
@@ -126,7 +127,7 @@ class LearnSchedule:
         if not self.has_recording:
             return self.forget()
         refuse_other_settings(self.folder, settings, self.settings)
-        self.spent, self.facts = spent, facts
+        self.spent, self.facts, self.minutes = spent, facts, max(self.minutes, minutes)
         if self.seconds > 60 * minutes and TRAINING in facts:  # more time for a finished world: train it on
             self.facts = {name: fact for name, fact in facts.items() if name == RECORDING}
             self.spent[SCORING] = 0.0

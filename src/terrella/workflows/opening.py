@@ -82,6 +82,10 @@ class EnvironmentConfig:
         if forkable:
             options["forkable"] = True
         if not rgb:
+            if not name.startswith("gym:") or name.startswith("gym:ALE/"):
+                raise TerrellaError(
+                    f"{name} always draws its pictures; only other gym: and mujoco: environments go without."
+                )
             options["rgb"] = False
         return library.load(name, **options)
 

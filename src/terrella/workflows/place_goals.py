@@ -46,9 +46,9 @@ class PlaceGoals:
         played, skipped, filmed = list[PlayedEpisode](), 0, False
         for number in range(episodes):
             own = seed + 1009 * number
-            goal = self._goal(real, number, own)
-            criterion = criterion_of(goal)
             try:
+                goal = self._goal(real, number, own)
+                criterion = criterion_of(goal)
                 settings = PlaySettings(steps, criterion, sees, keep, 0 if filmed else 1)
                 one = play(real, policy_for(goal), 1, settings, own)
                 played, skipped, filmed = played + one.episodes, skipped + one.skipped, True
