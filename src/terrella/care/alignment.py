@@ -72,10 +72,9 @@ def judge_alignment(runs: Sequence[EpisodeMotion], fps: float) -> AlignmentVerdi
 
 
 def _clear(gains: np.ndarray, best: int, agree: float) -> bool:
-    none = FARTHEST
-    if best == none or best in (0, len(gains) - 1):
+    if best in (FARTHEST, 0, len(gains) - 1):
         return False
-    cut = (gains[best] - gains[none]) / max(1e-9, 1 - gains[none])
+    cut = (gains[best] - gains[FARTHEST]) / max(1e-9, 1 - gains[FARTHEST])
     return gains[best] >= _LEAST_GAIN and cut >= _LEAST_CUT and agree >= _AGREE
 
 
@@ -99,8 +98,7 @@ def _reacts(runs: Sequence[EpisodeMotion]) -> bool:
         return False
     states = [np.hstack([state, np.ones((len(state), 1))]) for state in _standard([run.state for run in runs])]
     actions = _standard([run.action for run in runs])
-    folds = [np.arange(len(runs)) % 2 == fold for fold in (0, 1)]
-    left = sum(error.sum() for error in _errors(states, actions, folds))
+    left = sum(error.sum() for error in _errors(states, actions))
     return left < 0.3 * sum((action**2).sum() for action in actions)
 
 
@@ -129,19 +127,19 @@ def _left(parts: list[EpisodeMotion]) -> tuple[np.ndarray, np.ndarray]:
         np.hstack([motion[far - 1 : len(motion) - far - 1], state[far : far + len(target)], np.ones((len(target), 1))])
         for motion, state, target in zip(motions, states, targets)
     ]
-    folds = [np.arange(len(parts)) % 2 == fold for fold in (0, 1)]
-    base = np.stack(_errors(known, targets, folds))
+    base = np.stack(_errors(known, targets))
     left = []
     for shift in range(-far, far + 1):
         inputs = [np.hstack([a[far + shift : far + shift + len(t)], k]) for a, k, t in zip(actions, known, targets)]
-        left.append(np.stack(_errors(inputs, targets, folds)))
+        left.append(np.stack(_errors(inputs, targets)))
     return np.stack(left, 1), base
 
 
-def _errors(inputs: list[np.ndarray], targets: list[np.ndarray], folds: list[np.ndarray]) -> list[np.ndarray]:
+def _errors(inputs: list[np.ndarray], targets: list[np.ndarray]) -> list[np.ndarray]:
     """Squared error of each stretch, [targets] each, by a ridge regression over the other fold."""
     errors: list[np.ndarray] = [np.zeros(0)] * len(inputs)
-    for test in folds:
+    for fold in (0, 1):
+        test = np.arange(len(inputs)) % 2 == fold
         x = np.concatenate([inputs[i] for i in np.flatnonzero(~test)])
         y = np.concatenate([targets[i] for i in np.flatnonzero(~test)])
         weights = np.linalg.solve(x.T @ x + _RIDGE * len(x) * np.eye(x.shape[1]), x.T @ y)

@@ -155,12 +155,8 @@ def _counts(folder: Survey, busy: bool) -> Iterator[Fault]:
             before = number
         if count != len(folder.episodes):
             what = f"info.json counts {count} episodes, but meta/episodes lists {len(folder.episodes)}"
-            yield Fault(
-                INFO,
-                None,
-                what,
-                f"set total_episodes to {len(folder.episodes)}, or use --repair, which counts them again",
-            )
+            mend = f"set total_episodes to {len(folder.episodes)}, or use --repair, which counts them again"
+            yield Fault(INFO, None, what, mend)
         if length != expected:
             what = f"info.json counts {length} rows, but the episodes hold {expected}"
             yield Fault(INFO, None, what, f"set total_frames to {expected}")
@@ -184,9 +180,8 @@ def _duplicates(folder: Survey, rows: RowFacts, shown: FilmFacts) -> Iterator[Fa
     for first, later in equal_digests(numbers):
         known.add(later)
         seen = rows.episodes[later]
-        yield Fault(
-            seen.file, seen.first, f"episode {later} has the same actions and states as episode {first}", _TWINS
-        )
+        what = f"episode {later} has the same actions and states as episode {first}"
+        yield Fault(seen.file, seen.first, what, _TWINS)
     pictures = {number: digest.hexdigest() for number, digest in shown.digests.items() if number not in shown.static}
     if any(feature["dtype"] == "image" for feature in folder.features.values()):
         pictures = {number: seen.pictures.hexdigest() for number, seen in rows.episodes.items() if seen.changes}

@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -112,21 +113,16 @@ def _size(path: Path) -> tuple[int, int]:
 def _first(files: Sequence[str], look: Callable[[str], Any]) -> Any:
     """`look` of the first file that can be read; None where none can."""
     for file in files:
-        try:
+        with suppress(*_UNREADABLE):
             return look(file)
-        except _UNREADABLE:
-            continue
     return None
 
 
 def schemas_of(root: Path, data: Sequence[str]) -> Iterator[pa.Schema]:
     """The Arrow schemas of the data files that can be opened."""
     for name in data:
-        try:
-            with open_parquet(path_inside(root, name)) as file:
-                yield file.schema_arrow
-        except BROKEN:
-            continue
+        with suppress(*BROKEN), open_parquet(path_inside(root, name)) as file:
+            yield file.schema_arrow
 
 
 # -- columns ---------------------------------------------------------------------------------------------------------

@@ -258,11 +258,8 @@ class _Mender:
             length = piece.frame + piece.count if listed is None else listed.length
             ended = ACTION_VALID in self.features and self.source.about.get("terminal", True)
             known = {name: length - 1 for name in self.features if is_outcome(name)} if ended else {}
-        kept = {
-            name: min(max(0, count - piece.frame), piece.count)
-            for name, count in known.items()
-            if name in self.features
-        }
+        known = {name: count for name, count in known.items() if name in self.features}
+        kept = {name: min(max(0, count - piece.frame), piece.count) for name, count in known.items()}
         if listed is not None and piece.frame + piece.count < listed.length and ACTION_VALID in self.features:
             reader = RowReader({ACTION_VALID: self.features[ACTION_VALID]})  # the result of its last action is lost
             acted = np.flatnonzero(np.concatenate([part[ACTION_VALID].reshape(-1) for part in reader.columns(piece)]))

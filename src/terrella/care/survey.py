@@ -101,10 +101,8 @@ class Survey:
         """The sensors of the rows in meta/terrella.json; invalid ones are left out."""
         sensors = {}
         for name, stated in _mapping(self.about.get("sensors")).items():
-            try:
+            with suppress(*BROKEN):
                 sensors[name] = sensor_from_json(name, stated)
-            except BROKEN:
-                continue
         return sensors
 
     @property
@@ -226,11 +224,8 @@ def _streams(root: Path, about: Mapping, faults: list[Fault]) -> dict[str, Senso
     for file in list_files(root, "streams", ".parquet"):  # each table keeps its sensor too
         name = file.split("/")[1]
         if name not in sensors:
-            try:
-                with open_parquet(path_inside(root, file)) as table:
-                    sensors[name] = sensor_from_json(name, json.loads((table.schema_arrow.metadata or {})[b"sensor"]))
-            except (*BROKEN, RecursionError):
-                continue
+            with suppress(*BROKEN, RecursionError), open_parquet(path_inside(root, file)) as table:
+                sensors[name] = sensor_from_json(name, json.loads((table.schema_arrow.metadata or {})[b"sensor"]))
     if sensors:
         what = f"it does not declare the streams {', '.join(sensors)}, which lie in streams/"
         faults.append(Fault(WORLD, None, what, "use --repair, which declares them from their tables"))
@@ -282,25 +277,20 @@ def _same(a: float, b: float) -> bool:
 def _rate_of_rows(root: Path, data: Sequence[str]) -> float | None:
     rates: list[float | None] = []
     for name in _some(data):
-        try:
+        with suppress(*_BROKEN):
             table = read_whole(path_inside(root, name), ["timestamp"], _ROWS)
             time_s = table["timestamp"].to_numpy().astype(np.float64)
             rates += [_even(each) for each in np.split(time_s, np.flatnonzero(~(np.diff(time_s) > 0)) + 1)[:1000]]
-        except _BROKEN:
-            continue
     return _shared([rate for rate in rates if rate])
 
 
 def _rate_of_films(root: Path, films: Sequence[str]) -> float | None:
     rates = []
     for name in _some(films):
-        try:
-            with mp4.open_video(path_inside(root, name)) as (container, stream):
-                packets = (packet.pts for packet, _ in zip(container.demux(stream), range(_PACKETS)))
-                ticks = np.sort([pts for pts in packets if pts is not None])
-                rates.append(_even(ticks * float(stream.time_base or 0)))
-        except _BROKEN:
-            continue
+        with suppress(*_BROKEN), mp4.open_video(path_inside(root, name)) as (container, stream):
+            packets = (packet.pts for packet, _ in zip(container.demux(stream), range(_PACKETS)))
+            ticks = np.sort([pts for pts in packets if pts is not None])
+            rates.append(_even(ticks * float(stream.time_base or 0)))
     return _shared([rate for rate in rates if rate])
 
 

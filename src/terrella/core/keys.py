@@ -275,12 +275,10 @@ def _action(spec: Spec, text: str) -> list[float]:
     lower, (name, _, value) = [name.lower() for name in spec.action_names], text.lower().partition(":")
     if text.lower() in lower:
         at = lower.index(text.lower())
+        if isinstance(spec.action, spaces.Discrete):
+            return [low[0] + at]
         rest = neutral_action(spec).ravel() if isinstance(spec.action, spaces.MultiDiscrete) else 0
-        return (
-            [low[0] + at]
-            if isinstance(spec.action, spaces.Discrete)
-            else np.where(np.arange(len(low)) == at, high, rest).astype(np.float64).tolist()
-        )
+        return np.where(np.arange(len(low)) == at, high, rest).astype(np.float64).tolist()
     if isinstance(spec.action, spaces.MultiDiscrete) and name in lower and value:
         place, rest = lower.index(name), neutral_action(spec).ravel()
         text = ",".join(value if at == place else str(n) for at, n in enumerate(rest))

@@ -16,12 +16,7 @@ ACTION, REWARD, DONE = "action", "next.reward", "next.done"
 POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 NAME = re.compile(r"\w[\w.-]{0,200}")  # valid name of a feature, which also names files and folders
 MOST_AXES = 5
-ESTIMATES = (
-    "uncertainty",
-    "known",
-    "places",
-    "keyframes",
-)  # a learned world's own estimates, which are no training data
+ESTIMATES = ("uncertainty", "known", "places", "keyframes")  # of a learned world, so no training data
 RENAMED = {"cast": "objects"}  # channel of old recordings -> its name now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
 _IMAGES = "observation.images."

@@ -120,10 +120,16 @@ def collect(
         def missing() -> bool:
             return recorder.episodes < episodes if episodes is not None else recorder.rows < (frames or 0)
 
+        def report() -> None:
+            if progress:
+                progress(*((recorder.rows, frames) if frames is not None else (recorder.episodes, episodes or 0)))
+
         if missing():
-            with _at_work(workers, job):
-                report = progress and (lambda: _report(progress, recorder, episodes, frames))
+            try:
+                workers.begin(job)
                 _gather(recorder, workers, episodes, missing, report)
+            finally:
+                workers.close()
     return recorder
 
 
@@ -132,7 +138,7 @@ def _gather(
     workers: Workers,
     episodes: int | None,
     missing: Callable[[], bool],
-    report: Callable[[], None] | None,
+    report: Callable[[], None],
 ) -> None:
     next_number, done = recorder.episodes, dict[int, Parcel]()
     while missing():
@@ -147,21 +153,7 @@ def _gather(
             done[number] = answer
         while missing() and recorder.episodes in done:
             recorder.put_episode(done.pop(recorder.episodes))
-            if report:
-                report()
-
-
-def _report(progress: Callable[[int, int], None], recorder: Recorder, episodes: int | None, frames: int | None) -> None:
-    progress(*((recorder.rows, frames) if frames is not None else (recorder.episodes, episodes or 0)))
-
-
-@contextmanager
-def _at_work(workers: Workers, job: Job) -> Iterator[None]:
-    try:
-        workers.begin(job)
-        yield
-    finally:
-        workers.close()
+            report()
 
 
 class LocalWorkers:

@@ -93,9 +93,7 @@ class Dataset:
 
     def has(self, name: str) -> bool:
         """Whether episodes have an array (rgb, depth, pose, action, action_valid, reward, done) or a channel of this name."""
-        if name == "action_valid":
-            return any(map(is_action, self.features))
-        return name in self.channels
+        return any(map(is_action, self.features)) if name == "action_valid" else name in self.channels
 
     def feature(self, name: str) -> str | None:
         """The feature that `name` (an array, a channel or a feature) means; None for none."""

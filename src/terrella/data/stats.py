@@ -24,11 +24,7 @@ def summarise_pictures(pictures: np.ndarray) -> Summary:
 
 def _summary(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
     with np.errstate(over="ignore", invalid="ignore"):  # the deviation of numbers near the largest overflows
-        return _of(rows, count, shape)
-
-
-def _of(rows: np.ndarray, count: int, shape: tuple[int, ...]) -> Summary:
-    figures = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+        figures = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
     return {**{name: value.reshape(shape) for name, value in figures.items()}, "count": np.array([count])}
 
 

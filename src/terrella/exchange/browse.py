@@ -167,10 +167,8 @@ class Browse:
     # -- inside -------------------------------------------------------------------------------------------------------
 
     def _names(self) -> list[str]:
-        kinds, vectors = (
-            ("image", "depth", "points", "vector"),
-            ("action", "observation.state", "next.reward", "next.done"),
-        )
+        kinds = ("image", "depth", "points", "vector")
+        vectors = ("action", "observation.state", "next.reward", "next.done")
 
         def place(name: str) -> tuple[int, int]:
             kind = self.source.sensors[name].kind

@@ -57,7 +57,8 @@ class Live:
         return getattr(self._out, "port", None)
 
     def log(self, sensor_name: str, time_s: float, value: np.ndarray) -> None:
-        """Logs a copy of a reading, `time_s` seconds after `start_ns`. Only vectors are cast to their sensor's dtype."""
+        """Logs a copy of a reading, `time_s` seconds after `start_ns`. Vectors are cast to their sensor's dtype,
+        pictures, depth and points must have it."""
         sensor = self._sensors.get(sensor_name)
         if sensor is None:
             return self._lose(f"'{sensor_name}' is not a declared sensor; declare it, or do not log it.")

@@ -10,6 +10,7 @@ import logging
 import random
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from http.client import HTTPException, parse_headers
 from urllib.parse import urlsplit
 
@@ -151,12 +152,10 @@ class _Gate:
 
 
 async def _forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-    try:
+    with suppress(OSError):
         while data := await reader.read(2**16):
             writer.write(data)
             await writer.drain()
-    except OSError:
-        pass
 
 
 def _is_admitted(head: bytes) -> bool:

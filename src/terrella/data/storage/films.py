@@ -15,10 +15,8 @@ from . import mp4
 from .mp4 import Mp4Writer
 
 _MOST = 50_000_000  # frames of one file; more is damage
-_PACKED, _ZEROS = (
-    ("h264", "hevc", "av1", "libdav1d", "vp9"),
-    bytes(24),
-)  # entropy-coded packets never contain this run of zeros
+_PACKED = ("h264", "hevc", "av1", "libdav1d", "vp9")  # entropy-coded packets, which never contain this run of zeros
+_ZEROS = bytes(24)
 
 
 @dataclass(frozen=True)

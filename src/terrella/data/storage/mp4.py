@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -110,15 +110,8 @@ def trim_fragments(path: Path) -> None:
 
 BROKEN = (av.FFmpegError, OSError, IndexError, ZeroDivisionError, ValueError, OverflowError)
 KEYFRAME_EVERY = 8
-_CODEC = {
-    "preset": "veryfast",
-    "crf": "18",
-    "tune": "fastdecode,zerolatency",  # no frame waits in the encoder for later ones
-    "g": "8",
-    "keyint_min": "8",
-    "bf": "0",
-    "threads": "1",
-}
+_CODEC = {"preset": "veryfast", "crf": "18", "g": "8", "keyint_min": "8", "bf": "0", "threads": "1"}
+_CODEC["tune"] = "fastdecode,zerolatency"  # no frame waits in the encoder for later ones
 # While recording, every frame is a fragment of its own, so a cut file is readable up to its last frame.
 _GROWING = {"movflags": "frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
 FINISHED = {"movflags": "+faststart"}  # the index in front: a cut file still plays up to the cut
@@ -169,10 +162,8 @@ class Mp4Writer:
 
     def abandon(self) -> None:
         """Stops, and ignores errors."""
-        try:
+        with suppress(OSError, av.FFmpegError):
             self.close()
-        except (OSError, av.FFmpegError):
-            pass
 
     def _run(self) -> None:
         try:

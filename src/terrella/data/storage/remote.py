@@ -219,12 +219,10 @@ class Files:
                 time.sleep(min(0.1 * 3**attempt, 5.0))
             try:
                 return _in_time(action, self._timeout_s)
-            except (FileNotFoundError, NotADirectoryError):
+            except (FileNotFoundError, NotADirectoryError, DatasetError):
                 raise
             except PermissionError as error:
                 raise DatasetError(f"{self.root} refuses to {what} ({error}); check your credentials.") from error
-            except DatasetError:
-                raise
             except Exception as error:  # every file system has errors of its own
                 last = error
         why = (str(last).splitlines() or [""])[0][:300] or type(last).__name__
@@ -267,12 +265,9 @@ class Files:
         """Bytes in use, after files used longest ago were removed to make room for `size`."""
         # Reservations are counted before files: a file that arrives in between counts twice, never not at all.
         # A reservation without a lock is of a process that was killed.
-        coming = os.scandir(self._cache / ".coming")
-        coming = [entry for entry in coming if not _let_go(Path(entry.path), shutil.rmtree)]
-        files = []
-        for entry in os.scandir(self._cache):
-            if not entry.name.startswith("."):
-                files.append((entry.stat().st_mtime_ns, entry.stat().st_size, entry.path))
+        coming = [one for one in os.scandir(self._cache / ".coming") if not _let_go(Path(one.path), shutil.rmtree)]
+        kept = [entry for entry in os.scandir(self._cache) if not entry.name.startswith(".")]
+        files = [(entry.stat().st_mtime_ns, entry.stat().st_size, entry.path) for entry in kept]
         total = sum(int(entry.name.split("-")[0]) for entry in coming) + sum(bytes_ for _, bytes_, _ in files)
         for _, bytes_, path in sorted(files):
             if total + size <= self.budget_bytes:

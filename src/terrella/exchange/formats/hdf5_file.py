@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -140,12 +140,8 @@ def headers(items: Iterable[tuple[tuple[str, ...], Dataset]]) -> dict[Place, Arr
 
 def read_strings(dataset: Group | Dataset) -> list[str]:
     """The strings of a dataset [n]."""
-    if (
-        not isinstance(dataset, Dataset)
-        or dataset.dtype.kind not in "OS"
-        or dataset.ndim != 1
-        or len(dataset) > 1 << 24
-    ):
+    texts = isinstance(dataset, Dataset) and dataset.dtype.kind in "OS" and dataset.ndim == 1
+    if not texts or len(dataset) > 1 << 24:
         raise DatasetError(f"{dataset.file.filename}{dataset.name} holds no strings; restore it from a copy.")
     return [it.decode("utf-8", "replace") if isinstance(it, bytes) else str(it) for it in np.asarray(dataset)]
 
@@ -167,9 +163,8 @@ def store_readings(
     dtype: str = "",
 ) -> None:
     """Writes a sensor's readings as datasets of `shape`; targets: dataset name -> index of its first reading."""
-    more = {}
-    if sensor.kind != "vector":
-        more = {"chunks": (1, *shape[1:]), "compression": "gzip", "compression_opts": 1}
+    packed = {"chunks": (1, *shape[1:]), "compression": "gzip", "compression_opts": 1}
+    more = packed if sensor.kind != "vector" else {}
     made = {parent.create_dataset(name, shape, dtype or sensor.dtype, **more): at for name, at in targets.items()}
     row = 0
     for part in rows.batches(readings.values, sensor, where, min(len(readings.values), shape[0] + max(made.values()))):
@@ -190,13 +185,9 @@ def attributes(item: Group, without: Sequence[str] = ()) -> dict[str, object]:
     values = {}
     for name in item.attrs:
         if name not in without:
-            try:
-                value = rows.json_or_none(item.attrs[name])
-            except _HDF5_ERRORS:
-                continue
-            if value is not None:
-                values[name] = value
-    return values
+            with suppress(*_HDF5_ERRORS):
+                values[name] = rows.json_or_none(item.attrs[name])
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def json_attribute(item: Group, name: str) -> dict:

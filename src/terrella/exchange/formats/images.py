@@ -93,10 +93,7 @@ def _look(path: Path) -> tuple[Literal["image", "depth"], tuple[int, ...]]:
 def _load(path: Path, sensor: Sensor) -> np.ndarray:
     with _image(path) as picture:
         upright = ImageOps.exif_transpose(picture)
-        if sensor.kind == "depth":
-            value = rows.metres(np.asarray(upright))
-        else:
-            value = np.asarray(upright.convert("RGB"))
+        value = rows.metres(np.asarray(upright)) if sensor.kind == "depth" else np.asarray(upright.convert("RGB"))
     if value.shape != sensor.shape:
         raise DatasetError(f"{path} changed while it was read; read the folder again.")
     return np.array(value)

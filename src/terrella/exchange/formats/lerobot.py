@@ -74,7 +74,8 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRo
     left_out, notes = [], dict[str, None]()  # each note once, in order
     with Recorder(root, layout, interrupted="discard") as recorder:
         for number, take in enumerate(source.takes()):
-            at = _times(take, layout, lead, how)
+            clock = take.readings.get(lead, _NONE).time_s
+            at = clock if how.fps is None else row_times(take, layout.sensors, how.fps)
             if len(at) < 2:
                 left_out.append(f"take {number} was left out: it has {len(at)} row{'s' * (len(at) != 1)}")
                 continue
@@ -145,11 +146,6 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
         notes.append(f"{', '.join(sorted(png_streams))}: kept in the rows only, because pictures are PNG")
         layout = replace(layout, streams={name: sensor for name, sensor in streams.items() if name not in png_streams})
     return layout, notes
-
-
-def _times(take: Take, layout: Layout, lead: str, how: LeRobotRows) -> np.ndarray:
-    """float64 [T]: the times of a take's rows."""
-    return take.readings.get(lead, _NONE).time_s if how.fps is None else row_times(take, layout.sensors, how.fps)
 
 
 def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, how: LeRobotRows) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -137,10 +138,8 @@ class McapRecording:
 
     def abandon(self) -> None:
         """Closes the file as it is, without an index: the last chunk may be incomplete."""
-        try:
+        with suppress(OSError):
             self._file.close()
-        except OSError:
-            pass
 
     def _channel(self, topic: str, schema: Schema) -> int:
         if schema.name not in self._schemas:

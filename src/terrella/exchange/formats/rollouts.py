@@ -79,8 +79,8 @@ def _arrays(path: Path) -> dict[Place, Array]:
                     continue
                 with file.open(info) as member:
                     first = np.lib.format.read_magic(member) == (1, 0)
-                    name = f"read_array_header_{1 if first else 2}_0"
-                    shape, _, dtype = getattr(np.lib.format, name)(member)
+                    read_header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+                    shape, _, dtype = read_header(member)
                 key = info.filename.removesuffix(".npy")
                 size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
                 if dtype.hasobject or size > min(rows.MAX_BYTES, info.file_size):

@@ -28,16 +28,8 @@ from .mapping import (
 from .units import basic, quantity
 
 _MAX_SPLIT = 64  # an unnamed vector with more numbers (an embedding, a tactile skin) is kept whole
-_ENDINGS = {
-    "m": "m",
-    "cm": "cm",
-    "mm": "mm",
-    "rad": "rad",
-    "deg": "deg",
-    "mps": "m/s",
-    "radps": "rad/s",
-    "degps": "deg/s",
-}
+_ENDINGS = {unit: unit for unit in ("m", "cm", "mm", "rad", "deg")}
+_ENDINGS |= {"mps": "m/s", "radps": "rad/s", "degps": "deg/s"}
 _POSITION = re.compile(r"(?:p|pos|position|translation)_?([xyz])")
 _ROTATION = re.compile(r"(?:q|quat|quaternion|orientation|rotation)_?([wxyz])")
 
@@ -160,12 +152,8 @@ def _short(sensor: str) -> str:
 def _places(path: str, source: Source, embodiment: str) -> list[_Place]:
     places: list[_Place] = []
     for name, sensor in source.sensors.items():
-        if (
-            sensor.kind != "vector"
-            or len(sensor.shape) != 1
-            or sensor.dtype == "string"
-            or not _is_mapped(name, source)
-        ):
+        numbers = sensor.kind == "vector" and len(sensor.shape) == 1 and sensor.dtype != "string"
+        if not numbers or not _is_mapped(name, source):
             continue
         if name not in (ACTION, STATE) and not sensor.names and sensor.shape[0] > _MAX_SPLIT:
             continue
