@@ -120,8 +120,8 @@ def merge(
     Args:
         sources: Recordings in any format.
         out: Folder of the merged dataset (LeRobot v3).
-        mapping: TOML file that maps the numbers of each robot to merged dimensions. Without it, a mapping is guessed from the names
-            and written to OUT.toml, for you to check, edit and pass here.
+        mapping: TOML file that maps each robot's dimensions to the merged ones. Without it, a mapping is guessed from the names and
+            written to OUT.toml, for you to check, edit and pass here.
         dry: Write the guessed mapping and stop.
     """
     from ..exchange.convert import open_source
@@ -183,7 +183,7 @@ def label(
         folder: Recording to label. Pictures alone are enough.
         out: Folder of the labelled copy. `terrella train video` can learn a world from it.
         labelled: Recording with real actions, used to map keys to latent actions.
-        frames: Number of its frames to use.
+        frames: Frames of --labelled to use.
         seed: The same seed gives the same result.
     """
     from ..exchange import write_source

@@ -13,7 +13,7 @@ from .say import Json, say, show
 def learn(name: Positional[str], config: LearnConfig, practise: bool = False, json: Json = False) -> None:
     """Learn a world of an environment, in one go: a script explores and records it, a world is trained on that, and scored.
 
-    Stop it with Ctrl-C, or in any other way: the same command goes on where it was stopped.
+    Stop it at any time; the same command continues.
 
     Args:
         name: The environment (gym:CarRacing-v3, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or game (doom:my_way_home).

@@ -13,7 +13,10 @@ Json = Annotated[bool, arg(help="Print one JSON document on stdout instead of te
 Seed = Annotated[int, arg(help="The same seed gives the same result.")]
 Port = Annotated[int, arg(help="Port of the page; 0 picks a free one.")]
 Host = Annotated[
-    str, arg(help="Address to listen on. Any other than this machine needs a token; one is made if none is given.")
+    str,
+    arg(
+        help="Address to listen on. Any address but this machine's requires a token; one is generated if none is given."
+    ),
 ]
 Token = Annotated[str | None, arg(help="Secret that the address of the page must contain.")]
 

@@ -9,9 +9,9 @@ from .say import Json, say, show
 def score(name: Positional[str], config: workflow.ScoreConfig, json: Json = False) -> None:
     """Compare a world's predictions with a recording: pictures, states, poses, rewards, memory, speed.
 
-    Figures are kept in the folder as they come; the same command goes on where it was stopped.
+    Figures are saved as they are measured; the same command continues.
 
     Args:
-        name: What `terrella list` shows, or the path of a checkpoint.
+        name: A name of `terrella list`, or the path of a checkpoint or run.
     """
     show(workflow.score(name, config, progress=say), json)

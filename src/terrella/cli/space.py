@@ -80,8 +80,8 @@ def view(
 
     Args:
         world: A world of Gaussians: its folder, or the run that made it.
-        beside: Another world of Gaussians, or a file of them (as `space import` reads them), to compare it with. A world can be
-            merged on the page, too.
+        beside: Another world of Gaussians, or a file of them (as `space import` reads them), to compare it with. The page can
+            also merge that world into this one.
     """
     place = editable_place(world, beside)
 

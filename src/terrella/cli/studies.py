@@ -57,7 +57,8 @@ def transfer(config: TransferConfig, json: Json = False) -> None:
 def acceleration(world: Positional[str], config: AccelerationConfig, json: Json = False) -> None:
     """Time how fast a world imagines with a new random action at each control step, beside a simulator of the same task.
 
-    Reports imagined seconds per second, joules, the usable horizon, and how much return a policy retains that trained in the world.
+    Reports imagined seconds per second, joules, the usable horizon, and what share of the simulator-trained return a policy
+    trained in the world retains.
 
     Args:
         world: A learned world, or a simulator: a name of `terrella list`, or a path.

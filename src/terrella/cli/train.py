@@ -145,7 +145,8 @@ def dreams(
         name: The world: a name that `terrella list` shows, or a folder.
         data: A recording of the same game.
         out: Folder of the run: the world, a log, and pictures of truth, the old prediction and the new.
-        teacher: A world that draws a frame in many steps, as in `train distil`: its frames are the target of sharpness.
+        teacher: A world that draws a frame in many steps, as in `train distil`: its frames are the target
+            distribution.
     """
     master = None if teacher is None else _learned(teacher, device)
     _shown(lambda report: train_dreams(_learned(name, device), data, out, config, report, master), json, run=out)

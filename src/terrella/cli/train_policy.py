@@ -13,6 +13,6 @@ def policy(world: Annotated[str, arg(name="in")], config: TrainPolicyConfig, jso
     Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
-        world: The world to practise in: what `terrella list` shows, the path of a checkpoint or a run, or a simulator (gym:ID).
+        world: The world to practise in: a name of `terrella list`, the path of a checkpoint or run, or a simulator (gym:ID).
     """
     show(train_policy(world, config, progress=say), json)

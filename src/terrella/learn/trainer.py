@@ -374,7 +374,7 @@ def _cpu_has_bf16() -> bool:
 
 
 def device_named(name: str) -> torch.device:
-    """cpu, cuda, or auto (a GPU if there is one). TrainingError for a device that PyTorch does not have here."""
+    """cpu, cuda, or auto (CUDA if there is one, else the CPU). TrainingError for a device that PyTorch does not have here."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -36,7 +36,7 @@ class AccelerationConfig:
     reference: str | None = None  # Folder of a policy that was trained in the simulator --beside.
     batches: tuple[int, ...] = (1, 64, 1024, 4096)  # Batch sizes: episodes that are stepped at once.
     seconds: float = 1.0  # Seconds to time each batch size in each turn.
-    turns: int = 3  # World and simulator are timed in turn this many times; the median counts.
+    turns: int = 3  # Repetitions, alternating between world and simulator; the median is reported.
     episodes: int = 50  # Episodes in the simulator of --agent, of --reference and of random actions.
     device: Device = "auto"
     seed: int = 0  # The same seed gives the same actions.

@@ -37,7 +37,7 @@ class BuildSpaceConfig:
 
     text: str | None = None
     """Words instead of a layout: "a long room with two pillars and a red door". Their layout is saved as OUT/layout.json."""
-    gaussians: int = 120_000  # About how many Gaussians.
+    gaussians: int = 120_000  # Approximate number of Gaussians.
     seed: int | None = None  # Seed of everything that the words or the layout leave open.
     size: tuple[int, int] = (192, 256)  # Height and width of the pictures, in pixels.
 

@@ -23,7 +23,8 @@ class EditSpaceConfig:
     """One edit: at most one selection, and one action."""
 
     box: tuple[float, float, float, float, float, float] | None = None
-    """Select the box between two corners (x y z x y z, metres). Without a selection all is selected."""
+    """Select the box between two corners (x y z x y z, metres). Without a selection the edit applies to
+    everything."""
     sphere: tuple[float, float, float, float] | None = None  # Select the sphere around a point (x y z radius, metres).
     plane: tuple[float, float, float, float] | None = None  # Select one side of a plane (a b c d: a x + b y + c z > d).
     object: int | None = None  # Select the object with this number (`space view` shows it).

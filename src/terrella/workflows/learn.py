@@ -45,7 +45,7 @@ class LearnConfig:
     """Settings of `learn`."""
 
     minutes: float = 30.0
-    """Time for all of it, earlier runs included. With more than a finished world had, it is trained on."""
+    """Time for all of it, earlier runs included. More minutes train a finished world further."""
     out: Path | None = None
     """Folder for the recording, the run and the score; default: learned/ and the environment's name."""
     frames: int = 20_000  # Frames to record at most; recording ends sooner after an eighth of the time.

@@ -13,13 +13,15 @@ from .progress import Progress, silent
 if TYPE_CHECKING:
     from ..core.world import World
 
-Device = Annotated[str, arg(help="cpu, cuda, mps, or auto: a GPU if there is one.")]
-Fast = Annotated[bool, arg(help="Draw with ONNX Runtime, or with a compiled graph on a GPU, if that is faster here.")]
+Device = Annotated[str, arg(help="cpu, cuda, mps, or auto: CUDA if there is one, else the CPU.")]
+Fast = Annotated[
+    bool, arg(help="Draw with ONNX Runtime, or with a compiled graph on a GPU, if that is faster on this machine.")
+]
 
 
 @dataclass(frozen=True)
 class ControlsConfig:
-    """What a person sets of a world's actions. The world itself declares the rest, or it is chosen."""
+    """Names and keys of the actions. Default: as the world declares them."""
 
     keys: tuple[str, ...] = ()
     """Keys and their actions, by name or number: a=left d=right space=2, up+space=5 for both at once, w=0,1,0 of axes."""
@@ -39,12 +41,12 @@ class ControlsConfig:
 
 @dataclass(frozen=True)
 class EnvironmentConfig:
-    """What a person sets of an environment. The environment itself declares the rest."""
+    """Settings of the environment. Default: as it declares them."""
 
     size: tuple[int, int] | None = None
     """Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64."""
     fps: float | None = None
-    """Steps per second of a Gymnasium environment, before gym:ID@N holds actions; default: as declared, or 10."""
+    """Steps per second of a Gymnasium environment, not counting the action repeat N of gym:ID@N; default: as declared, or 10."""
     adapter: str | None = None
     """A Python file (FILE.py or FILE.py:NAME) with an Adapter that finds depth, poses and more."""
     randomise: str | None = None

@@ -55,7 +55,8 @@ class PractiseConfig:
     """Settings of `practise`."""
 
     minutes: float = 30.0
-    """Time for all rounds, earlier runs included. With more than finished rounds had, the last round is trained on."""
+    """Time for all rounds, earlier runs included. More minutes train the last round of a finished run
+    further."""
     out: Path | None = None
     """Folder for the recording, the worlds and the policies; default: learned/ and the environment's name."""
     frames: int = 20_000  # Frames to record at most, in all rounds.
@@ -178,7 +179,7 @@ def _round(
     """One round: collects, learns the world, practises. Returns its notes."""
     number, seed, minutes = len(done), config.seed, rounds.round_minutes(done)
     seconds = {at: 60 * minutes * share for at, share in SHARES.items()}
-    if not rounds.world(number).exists():  # else it has collected: the world that is being learned is of those frames
+    if not rounds.world(number).exists():  # a world exists only after collection
         with stage(COLLECTING, progress) as report:
             _collect(rounds, number, real, config, seconds[COLLECTING], report)
     with stage(LEARNING, progress) as report:

@@ -49,8 +49,8 @@ class ScoreConfig:
     data: Path  # The recording on which the world was trained; only the episodes held out of training are used.
     new: Path | None = None
     """A recording of places that training never saw; default: the part of the map that training kept out."""
-    fresh: bool = False  # Use every episode of `data`: another recording, of which training saw nothing.
-    quick: bool = False  # An answer in about a minute: few clips, short horizons, one setting of the world.
+    fresh: bool = False  # Use every episode of `data`: for a recording that training never used.
+    quick: bool = False  # Take about a minute: fewer clips, shorter horizons, and the world with its memory only.
     out: Path = Path("scores")  # Folder for scorecard.json and scorecard.html.
     clips: int | None = None  # Clips of each kind of place; default 50, quick 6. Intervals need 50 or more.
     horizons: tuple[int, ...] = ()

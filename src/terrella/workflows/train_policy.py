@@ -36,7 +36,8 @@ class TrainPolicyConfig:
     recording: Annotated[str | None, arg(name="from")] = None
     """A recording in whose states practice begins; default: where the world's own episodes begin."""
     grow: bool = False
-    """Start with --randomise ranges of width zero and widen them to those of the file while the policy copes."""
+    """Start with --randomise ranges of width zero and widen them to those of the file as the policy's return
+    holds up."""
     real: str | None = None
     """The environment in which the policy is tried afterwards (gym:Pendulum-v1), beside random actions from the same starts."""
     episodes: int = 20  # Episodes of that trial.

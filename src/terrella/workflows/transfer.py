@@ -44,10 +44,10 @@ class TransferConfig:
     real: str | None = None
     gap: Path | None = None
     """A TOML or JSON file of how the real robot differs at a gap of 1: parameters, delay, backlash, noise.CHANNEL."""
-    dial: float = 1.0  # The size of the gap, from 0 (none of the file) to 1 (all of it).
+    dial: float = 1.0  # Scale of the gap: 0 is the nominal robot, 1 the values of --gap.
     randomise: Path | None = None
     """A TOML or JSON file of parameter ranges, for domain randomisation and for system identification."""
-    # What policies are trained in, to compare: nominal (the simulator as it is), randomised and identified (with other
+    # Arms to compare, by where their policy is trained: nominal (the simulator as it is), randomised and identified (with other
     # parameters), model (with a learned correction), oracle (the real robot itself).
     arms: tuple[str, ...] = ARMS
     # Numbers of real episodes that models are fitted to. Identification uses 10, or the largest number if 10 is not listed.
@@ -55,7 +55,7 @@ class TransferConfig:
     episodes: int = 300  # Real episodes in which each policy is tested.
     seeds: int = 3  # Number of repetitions, each with its own training and its own real episodes to learn from.
     practice: int = 120
-    """PPO updates, of 6,144 steps each, to train the nominal policy, and as many again for each other arm."""
+    """PPO updates, of 6,144 steps each, to train the nominal policy, and again for each arm."""
     success: str = "success"  # An episode succeeds when this channel is above 0.
     # Also test policies that read their goal off a camera picture. Their encoders are trained on the simulator, on randomised
     # looks, adversarially with unlabelled real pictures, or on labelled real pictures.

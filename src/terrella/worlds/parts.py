@@ -130,7 +130,7 @@ class Scene(WorldPart, Protocol):
 
 @runtime_checkable
 class Generator(WorldPart, Protocol):
-    """Draws a frame by flow matching; config.steps: Euler steps a frame."""
+    """Draws a frame: a UNet by flow matching (config.steps: Euler steps a frame), or the Codec in one pass."""
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """The conditioning, with what the generator itself derives from it once a frame."""

@@ -29,7 +29,7 @@ TEST_STEPS = (1, 5, 25)  # to goals in held-out episodes
 class GoalTraining:
     """Settings of a goal-conditioned policy."""
 
-    farthest: int = 50  # Steps to a goal at most.
+    farthest: int = 50  # Largest number of steps from a state to its goal.
     hidden: int = 256  # Width of the networks' layers.
     steps: int = 4000  # Training steps.
     batch: int = 512  # Samples per step.

@@ -61,8 +61,8 @@ class LatentTraining:
     members: int = 3
     # Horizon in steps of the training rollouts. Default: 12, and with pictures 6; fewer where episodes are short.
     rollout: int | None = None
-    # Steps that one leap of the predictor covers, for planners that repeat an action or plan in strides of this length; 0 learns
-    # no leap. Default: 5, if the rollout is that long.
+    # Steps predicted at once (a leap), for planners that hold an action for as many steps; 0 trains none. Default: 5, if the
+    # rollout is that long.
     leap: int | None = None
     # Training steps. Training ends after these or after `hours`, whichever comes first. Default: 4000, and with pictures 2500.
     steps: int | None = None

@@ -42,7 +42,7 @@ class Practice:
     # Minutes of training, earlier runs included. Default: 5, unless --steps is given.
     minutes: float | None = None
     steps: int | None = None  # Training steps, each on one batch of rollouts.
-    # "ppo" takes several epochs over each batch (objectives/ppo.py), "actor-critic" one gradient step, as DreamerV3
+    # "ppo" takes several epochs over each batch (objectives/ppo.py), "actor-critic" one gradient step, as in DreamerV3
     # (objectives/actor_critic.py). Default: ppo in a simulator that steps many episodes together, as mujoco: does, else
     # actor-critic.
     method: Literal["actor-critic", "ppo"] | None = None
@@ -58,10 +58,10 @@ class Practice:
     entropy: float | None = None
     # With continuous actions, use the world's own gradients if it is differentiable. --no-gradients uses REINFORCE.
     gradients: bool = True
-    # Uncertainty of the world at which a rollout ends. Default: the level at which the world calls itself inventing, if it has
+    # Uncertainty of the world at which a rollout ends. Default: the world's own threshold for invented content, if it declares
     # one.
     trust: float | None = None
-    # Where a rollout ends by --trust, bootstrap from the lowest value in the batch instead of the critic's estimate.
+    # Where --trust ends a rollout, bootstrap from the lowest value in the batch instead of the critic's estimate.
     cautious: bool = False
     hidden: int = 128  # Width of the networks' layers.
     learning_rate: float = 1e-3  # Peak learning rate.

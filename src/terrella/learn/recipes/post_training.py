@@ -25,7 +25,7 @@ from ..trainer import Report, Run, Trainer, hold_then_decay
 class PostTraining:
     """Settings that both trainings share."""
 
-    batch: int = 16  # Frames per step, or rollouts in parallel.
+    batch: int = 16  # Batch size: frames (distil) or rollouts (dreams) per step.
     learning_rate: float = 3e-4  # Peak learning rate of the generator.
     teacher_weight: float = 1.0  # Weight of the teacher's distribution, if there is a teacher.
     # A box x0 y0 x1 y1 of the map in metres that training never sees. Default: the one that was kept out of the world's training.
@@ -41,7 +41,7 @@ class DistilConfig(PostTraining):
 
     flow_steps: int = 1  # Flow steps in which the student draws a frame.
     steps: int = 2000  # Training steps.
-    # Weight of the recorded frames. Alone they blur whatever is not determined.
+    # Weight of the recorded frames. Trained on these alone, the student averages over uncertain content and blurs.
     truth_weight: float = 0.25
     critic_weight: float = 0.2  # Weight of a patch critic.
 
@@ -52,7 +52,7 @@ class DreamsConfig(PostTraining):
 
     steps: int = 150  # Training steps, each on one batch of rollouts.
     horizon: int = 12  # Horizon: frames of a rollout, each of which is one update.
-    # Weight of the recorded frames. More is nearer to the recording, and blurs.
+    # Weight of the recorded frames. A larger weight follows the recording more closely, but blurs.
     truth_weight: float = 0.05
     critic_weight: float = 1.0  # Weight of a patch critic.
 

@@ -33,8 +33,7 @@ class SplatFit:
     episodes: int | None = None
     # Corners x0 y0 x1 y1 in metres: only pictures taken within, such as those of one room.
     box: tuple[float, float, float, float] | None = None
-    # Metres per unit of the poses. Default: 1; with poses from COLMAP such that the median depth is 3 m, for pictures alone have
-    # no scale.
+    # Metres per unit of the poses. Poses from COLMAP have no scale: they are first scaled to a median depth of 3 m.
     scale: float = 1.0
     # Pixels of the longer side of pictures; larger ones are scaled down. Recordings keep their size.
     longest: int = 480

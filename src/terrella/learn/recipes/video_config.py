@@ -26,12 +26,13 @@ class TrainConfig:
     # Training steps of the model that predicts reward, termination and vitals.
     outcome_steps: int = 1500
     # Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a recording with object
-    # instances. 0 draws them like everything else.
+    # instances. 0: no separate model, the generator draws them.
     objects_steps: int = 2500
-    # Learn what moves (monsters, doors, pick-ups), if a recording with depth and poses marks it.
+    # Learn what moves (monsters, doors, pick-ups), if a recording with depth and poses marks it. --no-moving treats everything as
+    # static.
     moving: bool = True
-    # Flow steps a frame. With more than one the whole flow from noise to frame is learned, so that a frame is a sample and not a
-    # mean: a teacher for `train distil`.
+    # Flow steps a frame. With more than one the whole flow from noise to frame is learned, so that a frame is a sample, not a
+    # mean. Such a world can be the teacher of `train distil`.
     flow_steps: int = 1
     # Training steps of the generator. Training ends after these or after `hours`, whichever comes first.
     steps: int = 8000
