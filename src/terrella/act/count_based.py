@@ -101,10 +101,9 @@ class _Play:
 class CountBased:
     """A policy for any world that shows pictures or numbers, without prior knowledge of it.
 
-    Observations are sorted into cells of three sizes (the downscaled pictures of Go-Explore, Ecoffet et al. 2019) and counted.
-    Q-learning with reward 1/sqrt(count) (Bellemare et al. 2016) learns where each action leads. In between, it holds random
-    actions, mixes them quickly, and rests; an action is usually released when the picture stands still. The length of a hold is
-    learned too. Statistics carry over from episode to episode; `log`, a file of 17 bytes a step, restores them.
+    Downscaled pictures (Go-Explore, Ecoffet et al. 2019) of three sizes are counted, and Q-learning with reward 1/sqrt(count)
+    (Bellemare et al. 2016) learns where each action leads. In between, it holds random actions, mixes them quickly, and rests.
+    Statistics carry over from episode to episode; `log`, a file of 17 bytes a step, restores them.
     """
 
     def __init__(self, spec: Spec, log: Path | None = None):

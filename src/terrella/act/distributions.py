@@ -1,7 +1,6 @@
 """Distributions over actions, from the outputs of a policy network: categorical, Bernoulli, or Gaussian squashed by tanh.
 
-A sample is float [N, D]: the number of each choice, each button, or a number that tanh brings between the limits (as in SAC,
-Haarnoja et al. 2018). `ActorConfig.actions` turns samples into actions of a world.
+A sample is float [N, D]: the number of each choice, each button, or a number before tanh (SAC, Haarnoja et al. 2018).
 """
 
 import math

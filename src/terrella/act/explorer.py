@@ -64,10 +64,9 @@ class _View:
 class Explorer:
     """A policy that covers a world.
 
-    In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places of the episode, through
-    openings that it sees, in between runs, turns, strafes, steps back, stops, looks around and random keys. With a channel
-    `things` it walks up to objects and shoots at them with ATTACK; it presses USE at obstacles. In other worlds it explores by
-    visit counts (act/count_based.py, to which `log` and `recall` belong).
+    In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places, mixed with random moves; it
+    walks up to `things`, shoots at them with ATTACK, and presses USE at obstacles. In other worlds it explores by visit counts
+    (act/count_based.py, to which `log` and `recall` belong).
     """
 
     def __init__(self, spec: Spec, log: Path | None = None):

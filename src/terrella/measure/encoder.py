@@ -1,8 +1,6 @@
-"""The fixed encoder of the scorecard: a small pretrained convnet from frames to features.
+"""The fixed encoder of the scorecard: a small pretrained convnet from frames to features, which `frechet` compares.
 
-It was trained by self-supervision to recognise the distortion of a picture and the picture itself (recipes/frame_encoder.py).
-Its features are compared by `frechet`. It is not trained together with any world, and a world must not be trained against
-it: a measure that is optimised no longer measures.
+It learned to recognise pictures and their distortions (recipes/frame_encoder.py). No world may be trained against it.
 """
 
 import hashlib
@@ -28,9 +26,8 @@ _TAPS = (1, 3, 5)  # stages whose means and deviations are read: texture, parts,
 class FrameEncoder(nn.Module):
     """Frames uint8 [N, H, W, 3], both sides at least MIN_SIDE, to features float32 [N, FEATURES].
 
-    Six convolutions; mean and standard deviation over the picture of three of them; a linear map to directions that vary
-    with distortions and little between intact pictures, scaled by `gain`. asinh limits large values, so that no single frame
-    dominates a set. Without batch normalisation: the features of a frame do not depend on its batch.
+    The mean and the standard deviation of three of six convolutions, mapped to directions that vary with distortions and little
+    between intact pictures; asinh limits large values. The features of a frame do not depend on its batch.
     """
 
     def __init__(self):

@@ -3,13 +3,11 @@
 Two Gaussians are fitted to the features of real and of dreamt frames, and their 2-Wasserstein distance, squared, is
     |m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^(1/2))          (Dowson and Landau 1982; "FID" where the features are Inception's).
 
-It is 0 if both sets look the same, and rises with blur, noise, wrong colours, blocks, ghosts, missing and invented things. It
-ignores which prediction belongs to which frame. Limits: it is not the FID of papers (another encoder), values at different
-frame sizes do not compare, it uses only means and covariances, and a wrong frame that looks real costs nothing (see PSNR).
+It is 0 if both sets look the same. It is not the FID of papers (another encoder), values at different frame sizes do not
+compare, and a wrong frame that looks real costs nothing (see PSNR).
 
-Finite samples: the plain value is biased upwards by about C / n. Both sets have equally many frames, which are left out in
-groups (clips), from both sets at once: the jackknife (Quenouille 1956, Tukey 1958) removes the 1/n term and gives the
-interval. A corrected value may be slightly below 0 if the sets are alike.
+The plain value is biased upwards by about C / n. The jackknife over frames, left out of both sets at once (Quenouille 1956,
+Tukey 1958), removes that term and gives the interval. A corrected value may be slightly below 0 if the sets are alike.
 """
 
 import math
@@ -33,11 +31,8 @@ def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
 def frechet_of_moments(
     mean_a: torch.Tensor, cov_a: torch.Tensor, mean_b: torch.Tensor, cov_b: torch.Tensor
 ) -> torch.Tensor:
-    """The same of means [..., D] and covariances [..., D, D].
-
-    tr (S1 S2)^(1/2) is the sum of the singular values of S1^(1/2) S2^(1/2), with symmetric roots by eigenvalues; those made
-    negative by rounding are set to 0. The usual root of the product would lose half of the digits.
-    """
+    """The same of means [..., D] and covariances [..., D, D]. tr (S1 S2)^(1/2) is the sum of the singular values of
+    S1^(1/2) S2^(1/2), with symmetric roots by eigenvalues: the usual root of the product would lose half of the digits."""
     cross = torch.linalg.svdvals(_root(cov_a) @ _root(cov_b)).sum(-1)
     traces = torch.diagonal(cov_a + cov_b, dim1=-2, dim2=-1).sum(-1)
     return ((mean_a - mean_b).square().sum(-1) + traces - 2 * cross).clamp_min(0)

@@ -31,10 +31,8 @@ def series(
         truth = torch.stack([rows_at(clips, name, context + step) for step in range(given.shape[1])], 1).double()
         last = rows_at(clips, name, context - 1).double()[:, None]
         far = [(some[..., :3] - truth[..., :3]).norm(dim=-1) for some in (given, last)]
-        cosines = [
-            (some[..., 3:] * truth[..., 3:]).sum(-1).abs().clamp(max=1) for some in (given, last)
-        ]  # of half the angle
-        turned = [2 * torch.arccos(cosine) for cosine in cosines]
+        cosines = [(some[..., 3:] * truth[..., 3:]).sum(-1).abs().clamp(max=1) for some in (given, last)]
+        turned = [2 * torch.arccos(half) for half in cosines]
         made += [Series(name, "distance", "m", -1, *far), Series(name, "turn", "rad", -1, *turned)]
     return made
 

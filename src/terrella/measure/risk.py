@@ -1,8 +1,7 @@
 """Risk-coverage: does the uncertainty of a world predict the errors of its frames?
 
-Frames are ordered by the world's `uncertainty`; the risk at coverage c is the mean error of the share c of most certain frames
-(El-Yaniv and Wiener 2010), and the area under that curve (AURC, Geifman et al. 2019) is its mean over all coverages. A random
-order gives the mean error; the order by the error itself (oracle) the least area.
+The risk at coverage c is the mean error of the share c of most certain frames (El-Yaniv and Wiener 2010); the area under that
+curve (AURC, Geifman et al. 2019) is the mean error in a random order, and least in the order of the errors (oracle).
 """
 
 from collections.abc import Sequence

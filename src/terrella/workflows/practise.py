@@ -1,7 +1,5 @@
 """`learn --practise`: collect, learn a latent world, practise in it, and again, each round with the policy of the last one.
 Discrete actions are learned by PPO, which avoids states of high uncertainty; continuous ones along the world's own gradients.
-
-Every stage continues where it was stopped, and the rounds that are over are noted in a file.
 A round's practice begins with the policy of the highest return so far; the better one of that and the last is the result.
 """
 

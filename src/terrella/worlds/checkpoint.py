@@ -1,8 +1,7 @@
 """A checkpoint on disk: a folder of world.json and data files, replaced as a whole.
 
-world.json names its data files. New data goes to files of new names; the rename of the new world.json over the old one then
-swaps all of it in one step, after which files that nothing names are removed. A reader sees the old world or the new one,
-also when the writer is killed at any point.
+New data goes to files of new names; the rename of a new world.json, which names them, then swaps all of it in one step. So a
+reader sees the old world or the new one, also when the writer is killed at any point.
 """
 
 import hashlib

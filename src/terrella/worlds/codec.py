@@ -1,8 +1,7 @@
 """Codec: a generator for worlds without depth, which fetches pixels before it paints any, as a video codec does.
 
-Each pixel of the next frame stays, comes from a displaced place of the last frame, from an older frame or from the mosaic (a
-choice, never an average, so nothing fades), or is painted in a colour of the recording's palette where no source has it: a
-pointer-generator mixture (See et al. 2017) over the block moves of the recording (learn/moves.py finds them).
+Each pixel is taken from the last frame, as it is or displaced by a move of the recording (learn/moves.py), from an older frame
+or the mosaic, or is painted in a colour of the recording's palette: a pointer-generator mixture (See et al. 2017).
 """
 
 from dataclasses import dataclass, replace

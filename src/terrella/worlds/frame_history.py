@@ -1,7 +1,6 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
-The last frames take the place of keyframes, unwarped. The actions are part of the context, since no motion model turns them
-into a view. Where pictures scroll, a mosaic remembers what left the picture.
+The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture.
 """
 
 from __future__ import annotations

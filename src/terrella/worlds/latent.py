@@ -1,8 +1,7 @@
 """LatentWorld: a world that predicts latents instead of pixels, for agents that plan and practise in thousands of episodes.
 
-An encoder turns pictures, state vectors or both into a latent; an ensemble of predictors moves it under actions; heads read
-reward, end and state vectors off it; the ensemble's disagreement gives the error to expect. Pictures are decoded only on
-request, for people (joint-embedding loss: LeWorldModel, Maes et al. 2026; ensemble: PETS, Chua et al. 2018).
+An ensemble of predictors moves the latent under actions (PETS, Chua et al. 2018); its disagreement gives the error to expect.
+Pictures are decoded only on request, for people (joint-embedding loss: LeWorldModel, Maes et al. 2026).
 """
 
 from __future__ import annotations

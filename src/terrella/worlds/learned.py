@@ -1,9 +1,7 @@
 """LearnedWorld: the world that is learned from recordings, made of parts.
 
-A body moves the viewer, a scene knows the view, a generator draws it, objects are painted over it, an outcome gives reward,
-end and vitals, an uncertainty the error to expect, and an estimator sees depth in pictures that come alone (parts.py). Each
-part owns its channels, its entries of the State and its settings. A frame is drawn when it is first read: a rollout that asks
-only for what the body decides never draws.
+Each part (parts.py) owns its channels, its entries of the State and its settings. A frame is drawn when it is first read: a
+rollout that asks only for what the body decides never draws.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Objects: things as billboards, each with a place and a look that change as in recordings.
 
-Looks (space/billboards.py) and moves are those that the recording showed. The next ones are sampled from the logits of a small
-network: a figure is never a mean of what it could do, so it stays sharp.
+Looks (space/billboards.py) and moves of the recording are sampled, never averaged, so that a figure stays sharp.
 """
 
 from collections.abc import Mapping, Sequence

@@ -95,8 +95,7 @@ class FrameOutcome(nn.Module):
     """A small convolutional network over the frames before and after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values of the recording (two-hot, as in Dreamer 3). A reward is the
-    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end also depends on the vitals
-    after the step: most games end when one of them is used up.
+    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end depends on the vitals after it.
     """
 
     kind = "frames"

@@ -1,7 +1,6 @@
 """Uncertainty: the error that a world expects of the frame that it has just drawn, learned from its own dreams.
 
-One small network beside the generator, no ensemble: from the conditioning, the drawn frame, and the way since the last
-evidence, it predicts the mean absolute error that such frames had.
+From the conditioning, the frame and the way since the last evidence, a network predicts the mean absolute error of such frames.
 """
 
 from collections.abc import Callable
