@@ -54,9 +54,8 @@ class LoopedActions:
         self.sequences = list(sequences)
 
     def begin(self, batch: int, rng: torch.Generator) -> torch.Tensor:
-        return torch.stack(
-            [torch.arange(batch), torch.zeros(batch, dtype=torch.int64)], 1
-        )  # index of the sequence, step
+        # index of the sequence, step
+        return torch.stack([torch.arange(batch), torch.zeros(batch, dtype=torch.int64)], 1)
 
     def act(
         self, observation: Observation, memory: torch.Tensor, rng: torch.Generator
@@ -131,11 +130,8 @@ class PairedEvaluation:
     def _open_loop_count(self) -> int:
         assert self.real is not None
         pictures = any(len(self.real.spec.channels[name].shape or ()) > 1 for name in self.compared)
-        kept = (
-            (OPEN_LOOP_WITH_PICTURES if pictures else OPEN_LOOP_EPISODES)
-            if self.compared and self.dream.spec.forkable
-            else 0
-        )
+        followed = self.compared and self.dream.spec.forkable
+        kept = 0 if not followed else OPEN_LOOP_WITH_PICTURES if pictures else OPEN_LOOP_EPISODES
         return min(kept, self.dream.spec.max_batch or kept)
 
     def _real_states(self, starts: EpisodeStarts) -> Iterator[State]:

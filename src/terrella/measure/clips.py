@@ -12,9 +12,8 @@ from ..core.errors import DatasetError, ObservationError
 from ..core.spec import Spec, kind_of
 from ..space.floorplan import horizon, sees_into
 
-Where = Callable[
-    [Any, int, int], np.ndarray
-]  # (clip cache, first, stop) -> bool [stop - first]: rows allowed in a clip
+# (clip cache, first, stop) -> bool [stop - first]: rows allowed in a clip
+Where = Callable[[Any, int, int], np.ndarray]
 
 
 @dataclass(frozen=True)

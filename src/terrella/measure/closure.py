@@ -191,11 +191,8 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
 
 def _label(arm: str, rows: Sequence[Row]) -> str:
     back, again = rows
-    return (
-        f"{arm}: void"
-        if back.void
-        else f"{arm}: back {back.figure.value:.1f} dB, far again {again.figure.value:.1f} dB"
-    )
+    figures = f"back {back.figure.value:.1f} dB, far again {again.figure.value:.1f} dB"
+    return f"{arm}: void" if back.void else f"{arm}: {figures}"
 
 
 def _scrolling(exam: Exam, world: World):

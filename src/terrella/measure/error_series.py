@@ -26,9 +26,7 @@ class Series:
     better: int  # +1 or -1, as in Row
     values: torch.Tensor  # [n, T], of the predictions
     copied: torch.Tensor  # [n, T], of the last context row, repeated
-    counts: torch.Tensor | None = (
-        None  # [n, T] pixels: if given, the others are summed squared errors, reported as pooled PSNR
-    )
+    counts: torch.Tensor | None = None  # [n, T] pixels, if the others are summed squared errors, for pooled PSNR
 
     @property
     def gain(self) -> torch.Tensor:

@@ -123,11 +123,9 @@ class Exam:
             last = {name: _sum(array[clip.context - 1]) for name, array in clip.channels.items()}
             return int(clip.episode), int(clip.start), clip.context, clip.horizon, _sum(clip.action), last
 
-        drawn = {
-            f"{kind} {place}": list(map(seen, some))
-            for kind, places in self.sets.items()
-            for place, some in places.items()
-        }
+        drawn = {}
+        for kind, places in self.sets.items():
+            drawn |= {f"{kind} {place}": list(map(seen, some)) for place, some in places.items()}
         arms = {arm: repr(world.spec) for arm, world in {**self.arms, **self.closing}.items()}
         return json.dumps([STORE_VERSION, identity, self.seed, asdict(self.config), arms, drawn])
 

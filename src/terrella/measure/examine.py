@@ -101,9 +101,8 @@ def write_report(card: Scorecard, folder: str | Path, title: str) -> tuple[Path,
 
 
 def _places(exam: Exam) -> list[PlaceSummary]:
-    return [
-        PlaceSummary(
-            name, len(clips), sum(clip.moves() for clip in clips) / len(clips), clips[0].context, clips[0].horizon
-        )
-        for name, clips in exam.places.items()
-    ]
+    places = []
+    for name, clips in exam.places.items():
+        moving = sum(clip.moves() for clip in clips) / len(clips)
+        places.append(PlaceSummary(name, len(clips), moving, clips[0].context, clips[0].horizon))
+    return places

@@ -156,11 +156,8 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
                             now = strip[f"truth, {name}"][:1]
                             strip[f"{arm}, {motion} motion, {name}"] = np.concatenate([now, frames.numpy()])
         columns = ["now", *(f"{step} step{'s'[: step > 1]}, {step * exam.dt_s:.2f} s" for step in exam.config.horizons)]
-        whole.pictures += [
-            Picture("pixels", f"{place_label(place)}, clip {number + 1}", columns, strip)
-            for number, strip in enumerate(strips)
-            if strip
-        ]
+        shown = {f"{place_label(place)}, clip {number}": strip for number, strip in enumerate(strips, 1) if strip}
+        whole.pictures += [Picture("pixels", title, columns, strip) for title, strip in shown.items()]
     return whole
 
 

@@ -52,10 +52,9 @@ def evaluate_policies(
     what = SUCCESS if SUCCESS in scores[ranked[0]][DREAM] else RETURN
     rows = {name: _figures_of(arms, scores.get(RANDOM), what, seed) for name, arms in scores.items()}
     evaluation = PolicyEvaluation(what, list(ranked), rows)
-    arms = {
-        arm: [scores[name][arm][what].double() for name in ranked if arm in scores[name]]
-        for arm in (REAL, DREAM, CONTROL)
-    }
+    arms = {}
+    for arm in (REAL, DREAM, CONTROL):
+        arms[arm] = [scores[name][arm][what].double() for name in ranked if arm in scores[name]]
     if not arms[REAL]:
         return evaluation
     real, dream, control = (torch.stack(arms[arm]) for arm in (REAL, DREAM, CONTROL))
@@ -101,11 +100,8 @@ def _mean_curves(open_loop: Mapping[str, Mapping[str, Sequence[float]]], rng: to
     """The mean of each curve over policies, with an interval over policies, as long as half of them go on."""
     bands = {}
     for channel in dict.fromkeys(name for curves in open_loop.values() for name in curves):
-        some = [
-            torch.tensor(list(curves[channel]), dtype=torch.float64)
-            for curves in open_loop.values()
-            if channel in curves
-        ]
+        known = [list(curves[channel]) for curves in open_loop.values() if channel in curves]
+        some = [torch.tensor(curve, dtype=torch.float64) for curve in known]
         values = torch.nn.utils.rnn.pad_sequence(some, batch_first=True, padding_value=math.nan)
         known = torch.isfinite(values)
         enough = int((known.double().mean(0) >= 0.5).cumprod(0).sum())

@@ -105,11 +105,8 @@ class Scorecard:
 
     def find(self, probe: str, what: str, **wanted) -> list[Row]:
         """The rows of a probe by measure, and by any other fields."""
-        return [
-            row
-            for row in self.rows
-            if (row.probe, row.what) == (probe, what) and all(getattr(row, key) == wanted[key] for key in wanted)
-        ]
+        rows = [row for row in self.rows if (row.probe, row.what) == (probe, what)]
+        return [row for row in rows if all(getattr(row, key) == wanted[key] for key in wanted)]
 
 
 def place_label(place: str) -> str:

@@ -41,11 +41,8 @@ def transfer_page(title: str, scores: TransferScores, facts: Mapping[str, object
     }
     rows = [(arm, [(figure, colours[arm])]) for arm, figure in scores.arms.items()]
     svg = dot_plot(rows, "success rate in the real environment", [(SUCCEEDS, QUIET)])
-    settings = "".join(
-        f"<li>{escape(name.replace('_', ' '))}: {escape(str(value))}</li>"
-        for name, value in facts.items()
-        if value not in ("", [], ())
-    )
+    given = {name.replace("_", " "): str(value) for name, value in facts.items() if value not in ("", [], ())}
+    settings = "".join(f"<li>{escape(name)}: {escape(value)}</li>" for name, value in given.items())
     parts = [
         f"<section><h2>{escape(lines[0])}</h2><ul>{words}</ul></section>",
         section("The arms", f"With 95% intervals; dotted: {SUCCEEDS:.0%}.", _wide(svg) + figures),
@@ -94,10 +91,8 @@ def _camera(scores: TransferScores) -> str:
 
 
 def _dialled(scores: TransferScores) -> str:
-    lines = [
-        _line(arm, sorted(gaps.items()), COLOURS[at % len(COLOURS)])
-        for at, (arm, gaps) in enumerate(scores.dial.items())
-    ]
+    dial = enumerate(scores.dial.items())
+    lines = [_line(arm, sorted(gaps.items()), COLOURS[at % len(COLOURS)]) for at, (arm, gaps) in dial]
     if not lines:
         return ""
     ticks = [(float(x), f"{x:g}") for x in lines[0].x]

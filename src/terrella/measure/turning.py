@@ -57,10 +57,8 @@ def scrolling_actions(
         for step in range(TRIAL_STEPS + 1):
             state = state if step == 0 else world.imagine(state, action.expand(len(clips), *action.shape), rng)
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
-        steps = (
-            torch.stack([moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]).float().sum(0)
-            / TRIAL_STEPS
-        )
+        scrolls = [moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]
+        steps = torch.stack(scrolls).float().sum(0) / TRIAL_STEPS
         went.append(steps[steps.abs().sum(1).argmax()])
     best = None
     for a, b in combinations(range(len(went)), 2):

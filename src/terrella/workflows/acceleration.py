@@ -112,11 +112,8 @@ def measure_acceleration(
     real = None if config.beside is None else _without_pictures(config.beside)
     arms = {"world": mine, **({"beside": real} if real else {})}
     for one in arms.values():
-        if (
-            one.spec.action_mode in (BUTTONS, CHOICE)
-            or not one.spec.forkable
-            or not np.isfinite(one.spec.action_limits).all()
-        ):
+        limited = one.spec.action_mode not in (BUTTONS, CHOICE) and np.isfinite(one.spec.action_limits).all()
+        if not (limited and one.spec.forkable):
             raise TerrellaError(
                 f"{one.spec.name} is no world of many streams with axes that have limits; give another."
             )

@@ -216,8 +216,5 @@ def _simulator(name: str, environment: EnvironmentConfig) -> World:
 
 def _shared(dream: Spec, real: Spec) -> Mapping[str, Any]:
     """The channels that both render in the same shape."""
-    return {
-        name: space
-        for name, space in dream.channels.items()
-        if name in real.channels and real.channels[name].shape == space.shape
-    }
+    both = {name: space for name, space in dream.channels.items() if name in real.channels}
+    return {name: space for name, space in both.items() if real.channels[name].shape == space.shape}

@@ -139,11 +139,9 @@ class EvaluationLog:
             raise TerrellaError(
                 f"{self.file.parent} was begun with other settings ({'; '.join(changed)}); repeat them, or give another --out."
             )
-        self._played = {
-            name: known
-            for name, known in played.items()
-            if known.get("mark") == self.fingerprints.get(name, known.get("mark"))
-        }
+        marks = {name: known.get("mark") for name, known in played.items()}
+        same = [name for name, mark in marks.items() if mark == self.fingerprints.get(name, mark)]
+        self._played = {name: played[name] for name in same}
 
 
 def _measured(episodes: list[PlayedEpisode]) -> dict[str, list[Any]]:

@@ -42,10 +42,8 @@ class PlanResult:
     def to_json(self) -> dict[str, Any]:
         arms = {name: _plain(getattr(self, name)) for name in ("planner", "random", "difference")}
         seed, ends = self.settings["seed"], {"stopped": self.stopped, "page": self.page, "film": self.film or ""}
-        curve = [
-            {"with": point.label, "imagined": point.imagined, **_plain(figures_of(point.played, seed))}
-            for point in self.curve
-        ]
+        figures = [_plain(figures_of(point.played, seed)) for point in self.curve]
+        curve = [{"with": one.label, "imagined": one.imagined, **row} for one, row in zip(self.curve, figures)]
         return jsonable({**self.settings, **arms, "curve": curve, **ends})
 
     def summary(self) -> str:

@@ -58,9 +58,7 @@ def _lines(name: str, progress: Progress) -> Report:
     def report(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
         nonlocal began, last_line, first, last_total, last_done
         now = time.monotonic()
-        if (
-            total != last_total or done < last_done
-        ):  # another part begins; what an earlier run did took none of its time
+        if total != last_total or done < last_done:  # another part begins, perhaps where an earlier run stopped
             began, first, last_total = now, done, total
         last_done = done
         if now - last_line < LINE_EVERY_S and (done < total or not total):

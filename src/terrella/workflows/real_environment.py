@@ -47,11 +47,8 @@ def check_alike(world: Spec, real: Spec) -> None:
         raise ActionError(f"the actions of {world.name} and {real.name} mean different things: {why}.")
     if not math.isclose(world.dt_s, real.dt_s, rel_tol=0.02):
         held = round(world.dt_s / real.dt_s)
-        hint = (
-            f"; {real.name}@{held} holds each action for {held} of its steps"
-            if real.name.startswith("gym:") and held > 1
-            else ""
-        )
+        holds = f"; {real.name}@{held} holds each action for {held} of its steps"
+        hint = holds if real.name.startswith("gym:") and held > 1 else ""
         raise PlanningError(
             f"{world.name} has {1 / world.dt_s:.4g} steps a second, and {real.name} {1 / real.dt_s:.4g}{hint or ': they differ'}."
         )

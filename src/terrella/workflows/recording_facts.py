@@ -21,11 +21,9 @@ def describe(spec: Spec) -> list[str]:
     chosen = lambda what: f" ({how[what]})" if isinstance(how, Mapping) and what in how else ""  # noqa: E731
     drawn, names = spec.channels.get("rgb"), spec.action_names
     height, width = (drawn.shape or (0, 0))[:2] if drawn is not None else (0, 0)
-    limit = (
-        f"{spec.max_episode_steps:,} steps, its time limit"
-        if spec.max_episode_steps
-        else f"{LONGEST:,} steps, as none is declared"
-    )
+    limit = f"{LONGEST:,} steps, as none is declared"
+    if spec.max_episode_steps:
+        limit = f"{spec.max_episode_steps:,} steps, its time limit"
     keys = ", ".join(f"{key} {_action_text(spec, action)}" for key, action in spec.keys.items() if "+" not in key)
     rest = _action_text(spec, neutral_action(spec).reshape(-1).tolist())
     return [

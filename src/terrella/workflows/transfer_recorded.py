@@ -53,10 +53,8 @@ class RecordedTransferResult:
 
     def summary(self) -> str:
         steps = sorted({step for row in self.open_loop.values() for step in row})
-        rows = [
-            [name, *(str(row[step]) for step in steps), str(self.action_error.get(name, ""))]
-            for name, row in self.open_loop.items()
-        ]
+        cells = {name: [str(row[step]) for step in steps] for name, row in self.open_loop.items()}
+        rows = [[name, *errors, str(self.action_error.get(name, ""))] for name, errors in cells.items()]
         rows += [[name, *("" for _ in steps), str(self.action_error[name])] for name in (RANDOM, IDLE)]
         heads = ["open-loop error of qpos (rad, m)", *(f"{step} steps" for step in steps)]
         lines = table_lines([*heads, "error of actions, shares of range"], rows)

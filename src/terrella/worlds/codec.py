@@ -54,9 +54,7 @@ class CodecInputs(NamedTuple):
     along: torch.Tensor  # int64 [B, H, W]: the move by which a pixel scrolls, 0 where something lies over the picture
     over: torch.Tensor  # bool [B, H, W]: what lies over the picture and does not scroll with it
     went: torch.Tensor  # [B, moves + 1, H, W]: how well each move that leads to a pixel explained the last step there
-    common: (
-        torch.Tensor
-    )  # [B, h, w, colours, 2]: share of each palette colour, in all of `scrolled` and around each square
+    common: torch.Tensor  # [B, h, w, colours, 2]: share of each colour in all of `scrolled` and around each square
 
 
 class Scroll(nn.Module):

@@ -128,10 +128,9 @@ class LatentWorld:
             "spread": state["spread"] + members.var(0, correction=0).mean(1),
         }
         held = {"reward": torch.zeros_like(state["reward"])}
-        kept = {
-            name: torch.where(still.view(-1, *[1] * (now.ndim - 1)), held.get(name, state[name]), now)
-            for name, now in after.items()
-        }
+        kept = {}
+        for name, now in after.items():
+            kept[name] = torch.where(still.view(-1, *[1] * (now.ndim - 1)), held.get(name, state[name]), now)
         return state.replace(**kept, done=still | (outcome.done > 0))
 
     def leap(self, state: State, actions: torch.Tensor, rng: torch.Generator) -> State:

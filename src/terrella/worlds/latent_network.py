@@ -77,9 +77,8 @@ class LatentEncoder(nn.Module):
             first = nn.Linear(len(config.columns) + 1, hidden)
             self.sense = nn.Sequential(first, nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
             width += hidden
-        self.project = nn.Sequential(
-            nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.SiLU(), nn.Linear(hidden, config.latent)
-        )
+        layers = nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.SiLU(), nn.Linear(hidden, config.latent)
+        self.project = nn.Sequential(*layers)
 
     def forward(self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, known: torch.Tensor | None):
         """rgb uint8 [N, 3, H, W]; numbers [N, S], scaled; known [N]: 0 where the numbers are not. Returns [N, D]."""

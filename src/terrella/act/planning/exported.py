@@ -28,9 +28,8 @@ class CostModel(nn.Module):
         if spec.observes != ("rgb",) or LATENT not in spec.channels or not isinstance(moves_of(spec), ContinuousMoves):
             raise PlanningError(f"{spec.name} must observe pictures alone, and have latents and continuous actions.")
         self.world, self.moves = world, moves_of(spec)
-        self.dtype_parameter = nn.Parameter(
-            torch.zeros(()), requires_grad=False
-        )  # solvers read the dtype of parameters
+        # solvers read the dtype of parameters
+        self.dtype_parameter = nn.Parameter(torch.zeros(()), requires_grad=False)
 
     @torch.no_grad()
     def get_cost(self, info: Mapping[str, Any], candidates: torch.Tensor) -> torch.Tensor:

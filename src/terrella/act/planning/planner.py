@@ -198,9 +198,8 @@ class Planner:
         for entry, episode in enumerate(episodes):
             rng = make_rng(later(episode.seed, 4 * episode.step + _PROPOSE))
             ahead, taken = state.at(entry).fork(self._proposals), []
-            goal = {
-                f"goal.{name}": value.expand(self._proposals, *value.shape[1:]) for name, value in episode.goal.items()
-            }
+            count, goal = self._proposals, episode.goal
+            goal = {f"goal.{name}": value.expand(count, *value.shape[1:]) for name, value in goal.items()}
             try:
                 assert self._proposal is not None
                 memory: Any = self._proposal.begin(self._proposals, rng)

@@ -126,7 +126,8 @@ class PlanningProblem:
             state = advance(self.world, state, held, make_rng(later(self.seeds[0], self._count)))
             return state, self.cost.step_cost(self._render(state, candidates), self.goal).cpu(), alive, None
         for _ in range(self.block):
-            seen = self._render(self._imagine(state, actions, candidates), candidates)
+            state = self._imagine(state, actions, candidates)
+            seen = self._render(state, candidates)
             step = self.cost.step_cost(seen, self.goal).cpu()
             if "done" in seen and self.cost.until_done:
                 step = step if alive is None else torch.where(alive, step, 0.0)

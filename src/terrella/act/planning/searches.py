@@ -97,9 +97,7 @@ class SearchResult:
     plan: torch.Tensor  # [B, H, D]
     cost: torch.Tensor  # [B]
     belief: torch.Tensor  # [B, H, D, K]
-    considered: (
-        torch.Tensor
-    )  # [B, M, H, D]: the best, the median and the worst plan of the last round, if there are as many
+    considered: torch.Tensor  # [B, M, H, D]: the best, the median and the worst plan of the last round, if it has three
 
 
 def search(problem: PlanningProblem, config: SearchConfig, start: WarmStart | None = None) -> SearchResult:
