@@ -70,7 +70,7 @@ def page_address(host: str, port: int, token: str | None) -> str:
 def application(
     index: str | Callable[[], bytes],
     routes: Sequence[BaseRoute],
-    lifespan: Callable[[Starlette], AbstractAsyncContextManager[None]],
+    lifespan: Callable[[Starlette], AbstractAsyncContextManager[None]] | None,
     host: str,
     token: str | None,
     policy: str | None = None,
@@ -95,7 +95,7 @@ def application(
     @contextlib.asynccontextmanager
     async def quiet_lifespan(app: Starlette) -> AsyncIterator[None]:
         quiet_accepting(asyncio.get_running_loop())
-        async with lifespan(app):
+        async with lifespan(app) if lifespan else contextlib.nullcontext():
             app.state.on_ready()
             yield
 

@@ -3,10 +3,9 @@
 import contextlib
 import json
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
@@ -66,10 +65,6 @@ def live_page(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator
         about, data = answer
         return Response(len(about).to_bytes(4, "little") + about + data, media_type="application/octet-stream")
 
-    @contextlib.asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        yield
-
     with contextlib.closing(open_port(host, port)) as listener, contextlib.ExitStack() as stack:
 
         def show(make: Callable[[], PlaceScene], facts: Mapping[str, Any]) -> None:
@@ -77,7 +72,7 @@ def live_page(host: str, port: int, on_ready: Callable[[str], None]) -> Iterator
             if not started.is_set():
                 started.set()
                 policy = PlacePage(make()).policy
-                app = application(newest.html, [Route("/now", now)], lifespan, host, None, policy)
+                app = application(newest.html, [Route("/now", now)], None, host, None, policy)
                 server = make_server(app, listener, host, None, on_ready, websockets=False)
                 thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
                 thread.start()

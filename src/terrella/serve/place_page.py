@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import gzip
 import hashlib
 import html
 import json
 import re
 import threading
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -246,13 +245,9 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)
 
-    @contextlib.asynccontextmanager
-    async def lifespan(app: Starlette) -> AsyncIterator[None]:
-        yield
-
     routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
     html = lambda: page.html(place.edits(), "/edits", frames="/frame")  # noqa: E731
-    return application(html, routes, lifespan, host, token, page.policy)
+    return application(html, routes, None, host, token, page.policy)
 
 
 def serve_place(

@@ -91,7 +91,7 @@ def apply_edits(
 
 
 def merges_of(edits: Sequence[Edit]) -> list[Edit]:
-    """Those that bring another place."""
+    """The edits that merge another place."""
     return [edit for edit in edits if edit.get("do") == "merge"]
 
 
@@ -118,7 +118,7 @@ def _placed(some: Gaussians, edit: Edit) -> Gaussians:
 
 
 def select(gaussians: Gaussians, edit: Edit, objects: torch.Tensor) -> torch.Tensor:
-    """Which Gaussians an edit is about: bool [N]; ContractError where it is about none, or not understood."""
+    """The Gaussians that an edit selects: bool [N]. ContractError if there is none, or the selection is not valid."""
     chosen = edit.get("select")
     if not isinstance(chosen, Mapping) or len(chosen) != 1 or next(iter(chosen)) not in SELECTIONS:
         raise ContractError(f"an edit selects one of {', '.join(SELECTIONS)}; got {chosen!r}.")
@@ -179,7 +179,7 @@ def _turned(some: Gaussians, degrees: float, middle: torch.Tensor, to: torch.Ten
 
 
 def _numbers(given: Any, count: int, name: str) -> torch.Tensor:
-    """float32 [count] that are finite."""
+    """`count` finite numbers: float32 [count]."""
     listed = [given] if isinstance(given, int | float) else given
     fits = isinstance(listed, Sequence) and not isinstance(listed, str) and len(listed) == count
     if count and not (fits and all(_plain(one) for one in listed)):

@@ -18,7 +18,7 @@ from .align import align
 from .camera import Intrinsics
 
 Network = TypeVar("Network", bound=nn.Module)
-_USUAL = 0.99  # the share of pictures like those that it learned from whose strangeness is below 1
+_USUAL = 0.99  # share of training pictures with strangeness below 1
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Estimator(nn.Module):
     kind = "network"
     prior: torch.Tensor  # logit of the mean code of the recordings' depth, at each pixel
     pace: torch.Tensor  # of a step of the recordings: metres forward, metres to the left, radians
-    usual: torch.Tensor  # mean of the looks of the pictures that it learned from [D]
-    spread: torch.Tensor  # a matrix that makes their looks white [D, D]
-    reach: torch.Tensor  # the length of a whitened look, below which _USUAL of them lie
+    usual: torch.Tensor  # mean of the looks of the training pictures [D]
+    spread: torch.Tensor  # matrix that whitens their looks [D, D]
+    reach: torch.Tensor  # quantile _USUAL of the norm of their whitened looks
 
     def __init__(self, config: EstimatorConfig):
         super().__init__()
@@ -77,7 +77,7 @@ class Estimator(nn.Module):
         return align(first, second, near, self.config.camera, self.pace)
 
     def strangeness(self, rgb: torch.Tensor) -> torch.Tensor:
-        """How unlike the pictures that it learned from (Mahalanobis distance of looks): [B], below 1 for _USUAL of those."""
+        """Mahalanobis distance of the looks from those of the training pictures: [B], below 1 for the share _USUAL of them."""
         return ((self.looks(rgb) - self.usual) @ self.spread).norm(dim=1) / self.reach
 
     # -- inside, and for training: pictures are float [B, 3, *size] in 0..1, or the same `normalise` --------------
@@ -101,7 +101,7 @@ class Estimator(nn.Module):
         return torch.cat([kept[0].std((2, 3)), kept[1].std((2, 3)), *light, *steps], 1)
 
     def learn_usual(self, looks: torch.Tensor) -> None:
-        """Takes looks [N, D] for usual."""
+        """Sets the usual looks from looks [N, D] of the training pictures."""
         values = looks.double()
         mean = values.mean(0)
         covariance = torch.cov(values.T) + 1e-6 * torch.eye(values.shape[1]) + 0.01 * torch.diag(values.var(0))
@@ -112,7 +112,7 @@ class Estimator(nn.Module):
         self.reach.copy_(((values - mean) @ spread).norm(dim=1).quantile(_USUAL))
 
     def code(self, depth: torch.Tensor) -> torch.Tensor:
-        """Metres -> the code of `depth_code`."""
+        """Metres to the code of `depth_code`."""
         near, far = self.config.near_m, self.config.far_m
         limits = torch.tensor([near, far], device=depth.device).log()
         return (depth.clamp(near, far).log() - limits[0]) / (limits[1] - limits[0])

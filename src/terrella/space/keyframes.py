@@ -48,7 +48,7 @@ class Keyframes:
 
     @staticmethod
     def none(size: tuple[int, int], device=None) -> Keyframes:
-        """No keyframes, of pictures of `size`."""
+        """No keyframes, for pictures of `size`."""
         shapes = {"rgb": (3, *size), "depth": size, "pose": (7,), "turn": (3, 3), "walls": (WALLS, 4)}
         shapes |= {name: (patch_count(size, stride), 9) for name, stride in (("coarse", COARSE), ("fine", FINE))}
         parts = {name: torch.zeros(0, *shape, device=device) for name, shape in shapes.items()}
@@ -56,7 +56,7 @@ class Keyframes:
 
     @staticmethod
     def joined(parts: Sequence[Keyframes]) -> Keyframes:
-        """Keyframes with pictures of one size, one after the other."""
+        """The concatenation of keyframes with pictures of one size."""
         if len(parts) == 1:
             return parts[0]
         return Keyframes(*(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Keyframes)))
@@ -79,7 +79,7 @@ def doubled(rgb: torch.Tensor) -> torch.Tensor:
 
 
 def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple[Keyframes, torch.Tensor]:
-    """One set of keyframes a view -> all of them, and each view's picks [B, S] among them (-1: none)."""
+    """One set of keyframes per view -> all of them, and the picks of each view [B, S] among them (-1: none)."""
     sets = [Keyframes.none(size) if keys is None else keys for keys in chosen]
     picks = torch.full((len(sets), max((len(keys) for keys in sets), default=0)), -1)
     start = 0
@@ -105,7 +105,7 @@ class Glimpse:
 
 
 def merge(glimpse: Glimpse) -> torch.Tensor:
-    """The slots' colours averaged by their squared trust: [B, 3, H, W] in [0, 1]."""
+    """The colours averaged with the squared trust of the slots: [B, 3, H, W] in [0, 1]."""
     weight = (glimpse.trust + 1e-4) ** 2
     return (glimpse.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
 
@@ -168,7 +168,7 @@ def vote_slowly(depth, pose, points, distance, camera) -> torch.Tensor:
 
 
 def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
-    """Of votes [B, K, P], the keyframes of which each adds most to what those before it cover: int64 [B, count], -1: no more."""
+    """Greedy choice by votes [B, K, P], each keyframe by what it adds to those before it: int64 [B, count], -1: no more."""
     picks = torch.full((len(votes), count), -1, device=votes.device)
     if not votes.shape[1]:
         return picks
@@ -188,7 +188,7 @@ def look(
     shared: Keyframes, picks: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int,
     own: Keyframes | None = None,
 ) -> Glimpse:  # fmt: skip
-    """The views of `size` from `pose` [B, 7] as the picked keyframes [B, S] (of `retrieve`) know them."""
+    """The views of `size` from `pose` [B, 7], from the picked keyframes [B, S] (see `retrieve`)."""
     own = Keyframes.none(size, pose.device) if own is None else own
     if pose.device.type != "cpu":
         return look_slowly(shared, picks, pose, camera, size, slots, own)
@@ -215,7 +215,7 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
         return Glimpse(nothing, nothing[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
 
     def both(part: str, change: Callable[[torch.Tensor], torch.Tensor] = lambda tensor: tensor) -> torch.Tensor:
-        """[B, S, ...]: that part of the picked keyframes, of own ones as `change` makes it."""
+        """[B, S, ...]: that part of the picked keyframes, after `change` for own ones."""
         first, second = getattr(shared, part), getattr(own, part)
         if not len(own):
             return first[picks.clamp_min(0)]

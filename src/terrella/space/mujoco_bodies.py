@@ -1,4 +1,4 @@
-"""Rigid things made of boxes that rest, fall and are pushed by who walks, in MuJoCo: a step is a pure function of numbers."""
+"""Rigid bodies of boxes that rest, fall and are pushed by walkers, in MuJoCo; a step is a pure function."""
 
 # pyright: reportAttributeAccessIssue=false
 # mujoco is a compiled module without declarations
@@ -15,10 +15,10 @@ from .occupancy import Walker
 
 STEP_S = 1 / 240
 DENSITY = 100.0  # kg/m^3: hollow wood
-FRICTION, GRIP = 0.5, 0.2  # of things, and of who pushes them
+FRICTION, GRIP = 0.5, 0.2  # of things, and of the walker
 WALKER_KG, PUSH_N = 75.0, 300.0
-FEET_M = 0.06  # what is lower does not meet who walks
-REST = 0.03  # m/s and rad/s: below it a thing is still
+FEET_M = 0.06  # lower things do not stop the walker
+REST = 0.03  # m/s and rad/s: slower things come to rest
 _THINGS, _WALKER = 1, 2  # bits: walls and things meet, and things meet the walker
 
 
@@ -112,7 +112,7 @@ class RigidBodies:
         return after, torch.cat([moving[..., :3], spin], 2), came
 
     def boxes(self, poses: torch.Tensor) -> torch.Tensor:
-        """Upright boxes [B, P, 6] around the parts of bodies at poses [B, K, 7]: on them one stands."""
+        """Upright boxes [B, P, 6] around the parts of bodies at poses [B, K, 7], on which walkers can stand."""
         mine = self._own > 0
         number, part = self._own[mine].long() - 1, self._boxes[mine]
         half, off = (part[:, 3:] - part[:, :3]) / 2, (part[:, :3] + part[:, 3:]) / 2 - self.rest[number, :3]

@@ -8,7 +8,7 @@ from .camera import FAR_M, NEAR_M, Intrinsics, rays, rotation, unproject
 from .kernels_numba.surfaces import lift
 from .views import arrays, each_view
 
-SLANT = 6.0  # a pixel that would cover this many times what it covers of a wall seen head-on is no surface
+SLANT = 6.0  # patches longer than this many times those of a wall seen head-on are no surface
 
 
 def patches(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:

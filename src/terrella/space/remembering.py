@@ -22,9 +22,9 @@ from .keyframes import Glimpse, merge
 from .memory import ROWS, Memory
 from .reproject import least_around
 
-SHELL_M = 8.0  # how far everything is taken to be, where nothing tells depth: right for turning on the spot
-_INNER = "world_"  # what the names of the inner world's tensors begin with
-_DREAMT = ("gone", "uncertainty")  # what worlds with an uncertainty note in their states
+SHELL_M = 8.0  # distance of everything where depth is unknown: right for turning on the spot
+_INNER = "world_"  # prefix of the inner world's tensors
+_DREAMT = ("gone", "uncertainty")  # tensors in the states of worlds with an uncertainty
 _OWN_CHANNELS = ("rgb", "depth", "pose", "reward", "done")
 
 
@@ -126,7 +126,7 @@ class Remembering:
         evident = (*self.world.spec.observes, *self.world.spec.may_observe)
         evidence = self.world.render(inner, [name for name in evident if name != "rgb"])
         blended = self.world.observe({**evidence, "rgb": rgb.permute(0, 2, 3, 1).contiguous()}, inner, rng)
-        # a blend is no evidence: how far the dream has gone from any, and what to expect of it, stay as they were
+        # a blend is no observation: the uncertainty, and the distance from the last observation, stay the same
         inner = blended.replace(**{name: inner[name] for name in _DREAMT if name in inner})
         held = before.replace(**self.memory.dreamt(before, rgb, depth, pose, glimpse.known))
         known = (known * 255).round().to(torch.uint8)

@@ -149,7 +149,7 @@ def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) 
 
 def _closed(depth: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] with FAR_M in holes -> the same without."""
-    for way in (least_around, fill_holes):  # the first closes the gaps of a surface that comes nearer
+    for way in (least_around, fill_holes):  # the first closes gaps in surfaces that come nearer
         depth = torch.where(depth < FAR_M, depth, way(depth))
     return depth
 

@@ -94,7 +94,7 @@ def write_scene(
 
 
 def replace_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """`write` fills a neighbour of `path`, which then takes its place; DatasetError where it cannot be written."""
+    """Writes a temporary neighbour of `path`, then renames it; DatasetError where it cannot be written."""
     try:
         with replacing(path) as staged:
             write(staged)

@@ -1,4 +1,4 @@
-"""SuperSplat's compressed PLY: 16 bytes a Gaussian, in blocks of 256 with the limits of each; harmonics a byte a number."""
+"""SuperSplat's compressed PLY: 16 bytes per Gaussian, in blocks of 256 with limits; harmonics a byte per number."""
 
 import numpy as np
 import torch
@@ -49,13 +49,13 @@ def _whole(rows: np.ndarray, name: str) -> np.ndarray:
 
 
 def unpacked_quats(packed: torch.Tensor) -> torch.Tensor:
-    """Quaternions w, x, y, z [n, 4] of int64 [n]: which component is largest (2 bits), and the other three in 10 bits each."""
+    """Quaternions w, x, y, z [n, 4] of int64 [n]: the index of the largest component (2 bits), the other three in 10 bits each."""
     three = torch.stack([((packed >> shift) & 1023) / 1023 - 0.5 for shift in (20, 10, 0)], 1) * 2**0.5
     return whole_quats(three, packed >> 30)
 
 
 def whole_quats(three: torch.Tensor, which: torch.Tensor) -> torch.Tensor:
-    """Quaternions of length 1 [n, 4] of their three smaller components [n, 3] and the number of the largest, int64 [n]."""
+    """Unit quaternions [n, 4] from their three smaller components [n, 3] and the index of the largest, int64 [n]."""
     whole = torch.zeros(len(three), 4)
     others = torch.tensor([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[which]
     largest = (1 - three.square().sum(1, keepdim=True)).clamp_min(0).sqrt()
@@ -63,7 +63,7 @@ def whole_quats(three: torch.Tensor, which: torch.Tensor) -> torch.Tensor:
 
 
 def packed_quats(quats: torch.Tensor) -> torch.Tensor:
-    """The way back of `unpacked_quats`."""
+    """The inverse of `unpacked_quats`."""
     quats = quats / quats.norm(dim=1, keepdim=True)
     which = quats.abs().argmax(1)
     quats = quats * torch.where(quats.gather(1, which[:, None]) < 0, -1.0, 1.0)
@@ -73,7 +73,7 @@ def packed_quats(quats: torch.Tensor) -> torch.Tensor:
 
 
 def encode(gaussians: Gaussians) -> bytes:
-    """A compressed PLY; Gaussians are put into the order of a curve through space (Morton), so that blocks are small."""
+    """A compressed PLY, with the Gaussians in Morton order, so that blocks are small in space."""
     low = gaussians.means.amin(0)
     cell = (gaussians.means - low) / (gaussians.means.amax(0) - low).clamp_min(1e-9) * 1023
     bits = cell.long().clamp(0, 1023)

@@ -16,7 +16,7 @@ _VERTICES, _INDICES = 34962, 34963
 
 
 def encode_mesh(mesh: Mesh, name: str) -> bytes:
-    """A mesh in glTF's own axes; its colours as screens have them are made linear, as glTF wants them."""
+    """A mesh in glTF's own axes, with its sRGB colours made linear, as glTF requires."""
     linear = (mesh.colours.numpy() / 255) ** 2.2
     colours = np.concatenate([linear, np.ones((len(linear), 1))], 1).astype(np.float32)
     parts = {"POSITION": mesh.vertices.numpy().astype(np.float32), "COLOR_0": colours}

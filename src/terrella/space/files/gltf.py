@@ -1,4 +1,4 @@
-"""glTF 2.0 as other tools write it (.glb, .gltf): its JSON, tables of numbers and pictures; broken and hostile ones refused."""
+"""glTF 2.0 (.glb, .gltf): its JSON, tables of numbers and pictures; broken and hostile files are rejected."""
 
 import base64
 import binascii
@@ -26,14 +26,14 @@ _KNOWN = {
 
 @dataclass(frozen=True)
 class Gltf:
-    """about: what the JSON says; buffers: the bytes that it speaks of; folder: where it lies, for pictures beside it."""
+    """about: the JSON; buffers: its binary data; folder: that of the file, for pictures beside it."""
 
     about: dict[str, Any]
     buffers: tuple[bytes, ...]
     folder: Path
 
     def named(self, kind: str, index: Any) -> dict[str, Any]:
-        """The entry of that number in a list of the JSON; ValueError where there is none."""
+        """Entry `index` of a list in the JSON; ValueError where there is none."""
         entries = self.about.get(kind, [])
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
             raise ValueError(f"it speaks of number {str(index)[:20]} of its {kind}, which it has not")
@@ -42,11 +42,11 @@ class Gltf:
         return entries[index]
 
     def count(self, index: Any) -> int:
-        """How many rows an accessor has, by its own word."""
+        """The number of rows that an accessor states."""
         return _whole(self.named("accessors", index), "count")
 
     def numbers(self, index: Any, *widths: int) -> np.ndarray:
-        """The rows of an accessor, [count, width], one of `widths`; whole numbers that stand for shares as float32 in -1..1."""
+        """The rows of an accessor, [count, width], with a width among `widths`; normalised integers as float32 in -1..1."""
         about = self.named("accessors", index)
         if "sparse" in about:
             raise ValueError("it has sparse accessors, which are not read")
@@ -65,7 +65,7 @@ class Gltf:
         return rows
 
     def picture(self, texture: Any) -> np.ndarray:
-        """The picture of a texture: uint8 [height, width, 4], at most SIDE a side; its size is looked at before it is unpacked."""
+        """The picture of a texture: uint8 [height, width, 4], at most SIDE a side; its size is checked before decoding."""
         about = self.named("textures", texture)
         webp = about.get("extensions", {}).get("EXT_texture_webp", {})
         image = self.named("images", webp.get("source", about.get("source")))
@@ -90,7 +90,7 @@ class Gltf:
 
 
 def open_gltf(path: Path) -> Gltf:
-    """The file without its meshes unpacked; ValueError or KeyError for what is broken, cut short or compressed."""
+    """The file, with its meshes not decoded; ValueError or KeyError if it is broken, cut short or compressed."""
     data = path.read_bytes()
     text, body = _chunks(data) if data[:4] == GLTF else (data, b"")
     about = json.loads(text)
@@ -131,7 +131,7 @@ def _chunks(data: bytes) -> tuple[bytes, bytes]:
 
 
 def _of_uri(uri: Any, folder: Path) -> bytes:
-    """What a buffer or picture outside of the .glb holds: written into the JSON, or in a file beside it."""
+    """The data of a buffer or picture outside the .glb: in the JSON, or in a file beside it."""
     if str(uri).startswith("data:"):
         try:
             return base64.b64decode(str(uri).partition(",")[2], validate=True)
@@ -144,7 +144,7 @@ def _of_uri(uri: Any, folder: Path) -> bytes:
 
 
 def _whole(about: dict[str, Any], name: str, usual: int | None = None) -> int:
-    """A count or length that the JSON states."""
+    """A count or length in the JSON."""
     value = about.get(name, usual)
     if type(value) is not int or value < 0:
         raise ValueError(f"its {name} is {str(value)[:20]}, which is no length")

@@ -1,4 +1,4 @@
-"""The scene of a glTF file: triangles where they stand in the world, with colours, pictures and names; lights; or Gaussians."""
+"""The scene of a glTF file: triangles in the world with colours, pictures and names; lights; or Gaussians."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
 
 
 def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """All nodes of the scene that is shown, and what each does to points [4, 4], `whole` after that."""
+    """All nodes of the shown scene, each with its matrix [4, 4] to the world, which ends with `whole`."""
     about = file.about
     if "scenes" in about:
         roots = file.named("scenes", about.get("scene", 0)).get("nodes", [])
@@ -156,7 +156,7 @@ def _scene(file: Gltf, nodes: list, parts: list) -> GltfScene:
 
 
 def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarray:
-    """Corners [F, 3, 9] of a primitive; those that are none (no area, not finite) are left out."""
+    """Corners [F, 3, 9] of a primitive, without triangles that have no area or are not finite."""
     given = part["attributes"]
     places = file.numbers(given["POSITION"], 3)
     count = len(places)
@@ -182,7 +182,7 @@ def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarr
 
 
 def _material(file: Gltf, about: dict[str, Any], pictures: dict[int, np.ndarray]) -> Material:
-    """The material of an entry; `pictures` are those that were unpacked already."""
+    """The material of an entry; `pictures` caches decoded pictures."""
     surface, more = about.get("pbrMetallicRoughness", {}), about.get("extensions", {})
     texture = surface.get("baseColorTexture", {})
     index, bent = texture.get("index"), texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -223,7 +223,7 @@ def _lights(file: Gltf, nodes: list) -> tuple[Light, ...]:
 
 
 def _gaussians(file: Gltf, matrix: np.ndarray, attributes: dict[str, Any]) -> Gaussians:
-    """Gaussians of a primitive where its node stands, in glTF's frame."""
+    """The Gaussians of a primitive, transformed by its node, in glTF's frame."""
     given = {name.rpartition(":")[2]: index for name, index in attributes.items()}
     take = lambda name, width: torch.from_numpy(file.numbers(given[name], width).astype(np.float32))  # noqa: E731
     orders = [f"SH_DEGREE_{degree}_COEF_{at}" for degree in range(4) for at in range(2 * degree + 1)]

@@ -1,4 +1,4 @@
-"""PLY: its header and its tables, hostile ones refused; and Gaussians as 3D Gaussian Splatting's code and gsplat write them."""
+"""PLY: its header and tables (hostile ones are rejected), and Gaussians as in 3D Gaussian Splatting's code and gsplat."""
 
 import numpy as np
 import torch

@@ -20,7 +20,7 @@ _ROW = 64  # palette entries in a row of the picture of harmonics
 
 
 def zipped(data: bytes) -> Gaussians:
-    """The Gaussians of a .sog; ValueError or KeyError for what is broken, too large or missing."""
+    """The Gaussians of a .sog; ValueError or KeyError for broken, too large or missing parts."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             longest = max((about.file_size for about in archive.infolist()), default=0)
@@ -94,7 +94,7 @@ def _codebook(meta: Mapping[str, Any], of: str) -> np.ndarray:
 
 
 def _picture(data: bytes) -> np.ndarray:
-    """uint8 [height, width, 4]; its size is looked at before it is unpacked."""
+    """uint8 [height, width, 4]; its size is checked before decoding."""
     with Image.open(io.BytesIO(data), formats=["WEBP"]) as image:
         if image.width * image.height > 2 * MOST:
             raise ValueError(f"it has a picture of {image.width:,} x {image.height:,} pixels")

@@ -126,7 +126,7 @@ def _first_three(part: torch.Tensor) -> torch.Tensor:
 
 
 def _smallest_three(part: np.ndarray) -> torch.Tensor:
-    """Of x, y, z, w which is largest (2 bits), the others from the last one on: 9 bits and a sign each."""
+    """Quaternions of the index of the largest of x, y, z, w (2 bits) and the others from the last on: 9 bits and a sign each."""
     packed = np.ascontiguousarray(part).view("<u4")[:, 0].astype(np.int64)
     which, quats = packed >> 30, np.zeros((len(packed), 4), np.float32)
     for axis in (3, 2, 1, 0):
@@ -139,7 +139,7 @@ def _smallest_three(part: np.ndarray) -> torch.Tensor:
 
 
 def encode(gaussians: Gaussians, version: Version = 3) -> bytes:
-    """Places as far as 2,048 m to a quarter of a millimetre, farther ones less exactly."""
+    """Places are exact to a quarter of a millimetre up to 2,048 m, and less exact for larger scenes."""
     far = float(gaussians.means.abs().amax().clamp_min(1e-6))
     fraction = int(np.clip(np.floor(np.log2((2**23 - 1) / far)), 0, _FRACTION))
     whole = (gaussians.means.double() * 2**fraction).round().clamp(-(2**23), 2**23 - 1).long().numpy() & 0xFFFFFF

@@ -1,4 +1,4 @@
-"""COLMAP through pycolmap: reads its models, and finds poses and points of plain pictures (x right, y down, z forward)."""
+"""COLMAP through pycolmap: reads its models, and computes poses and points of pictures (x right, y down, z forward)."""
 
 import shutil
 from pathlib import Path
@@ -32,7 +32,7 @@ def model_of(folder: Path) -> Path | None:
 
 
 def read_colmap(folder: Path) -> Shots:
-    """The pictures that a model places, levelled by how they were held; DatasetError says what is wrong with it."""
+    """The posed pictures of a model, levelled by their average up direction; DatasetError for a broken model."""
     colmap, model = _pycolmap(), model_of(folder)
     if model is None:
         raise DatasetError(f"{folder} has no model of COLMAP (sparse/0/cameras.bin); give the folder that holds one.")

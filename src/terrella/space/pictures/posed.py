@@ -1,4 +1,4 @@
-"""Pictures with a pose and a lens each, of any lenses, as views of one ideal pinhole camera that sees what all of them see."""
+"""Posed pictures of any lenses as views of one ideal pinhole camera, whose view is common to all of them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Lens:
     pixels: Callable[[np.ndarray], np.ndarray]
 
     def extent(self) -> np.ndarray:
-        """Tangents left, top, right, bottom of a rectangle all of which the lens shows."""
+        """Tangents left, top, right, bottom of a rectangle that is wholly in the lens's view."""
         fx, fy, cx, cy = self.focal
         box = np.array([-cx / fx, -cy / fy, (self.width - cx) / fx, (self.height - cy) / fy])
         for _ in range(200):
@@ -62,7 +62,7 @@ class Shots:
 
 
 def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
-    """A pose [7] of a rotation whose columns are forward, left and up, and a place; DatasetError for what is none."""
+    """The pose [7] of a rotation with columns forward, left and up, and a place; DatasetError if it is none."""
     good = np.isfinite(rot).all() and np.isfinite(place).all() and np.abs(place).max() < 1e6
     if not good or np.abs(rot.T @ rot - np.eye(3)).max() > 0.01 or np.linalg.det(rot) < 0:
         raise DatasetError(f"{where}: its pose is no rotation and a place of finite numbers; mend or remove it.")
@@ -70,7 +70,7 @@ def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
 
 
 def levelled(shots: Shots) -> Shots:
-    """The same with z up: on average the pictures are held upright; and with the middle point MIDDLE_M away."""
+    """The same with z up, the average up direction of the pictures, and with the median point MIDDLE_M away."""
     up = rotation(shots.pose)[..., 2].mean(0)
     up = up / up.norm().clamp_min(1e-6)
     side = torch.linalg.cross(torch.eye(3)[up.abs().argmin()], up)
@@ -118,7 +118,7 @@ def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:
 
 
 def _as_taken(file: Path, lens: Lens, longest: int) -> np.ndarray:
-    """The picture in the orientation that fits its lens."""
+    """The picture, rotated by EXIF or not, whichever fits its lens."""
     for upright in (True, False):
         picture = read_picture(file, upright, longest)
         if abs(picture.shape[1] / picture.shape[0] / (lens.width / lens.height) - 1) < 0.03:

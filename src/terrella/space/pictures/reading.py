@@ -1,4 +1,4 @@
-"""Reads pictures that people have: of any mode, turned as EXIF says, 8 or 16 bits; what is none is refused in a sentence."""
+"""Reads pictures of any mode with 8 or 16 bits, rotated by EXIF, and videos; broken ones are rejected."""
 
 import warnings
 from pathlib import Path
@@ -44,7 +44,7 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
 
 
 def _rgb(picture: Image.Image) -> Image.Image:
-    """Any mode as RGB: 16 bits scaled to 8, what is transparent on black."""
+    """Any mode as RGB: 16 bits scaled to 8, transparency on black."""
     if picture.mode.startswith(("I", "F")):
         numbers = np.asarray(picture).astype(np.float64)
         most = 65535 if picture.mode.startswith("I") and numbers.max() > 255 else max(float(numbers.max()), 1e-9)
@@ -56,20 +56,20 @@ def _rgb(picture: Image.Image) -> Image.Image:
 
 
 def sharpness(picture: np.ndarray) -> float:
-    """Second differences over first ones: small for what is out of focus or shaken, however much or little there is to see."""
+    """Second over first differences: small for a blurred picture, whatever it shows."""
     grey = picture[..., 1].astype(np.float32)
     second, first = (sum(np.abs(np.diff(grey, order, axis)).mean() for axis in (0, 1)) for order in (2, 1))
     return float(second / max(first, 0.25))
 
 
 def blurred(pictures_sharpness: list[float]) -> list[bool]:
-    """Which of a set are much less sharp than is usual in it."""
+    """Which pictures of a set are much less sharp than its median."""
     usual = float(np.median(pictures_sharpness)) if pictures_sharpness else 0.0
     return [one < BLURRED * usual for one in pictures_sharpness]
 
 
 def video_pictures(path: Path, count: int, longest: int) -> list[np.ndarray]:
-    """At most `count` frames of a video, the sharpest of each of `count` equal parts of it: uint8 [H, W, 3] each."""
+    """At most `count` frames of a video, the sharpest of each of `count` equal parts: uint8 [H, W, 3] each."""
     import av
     from av.error import FFmpegError
 

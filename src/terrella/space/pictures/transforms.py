@@ -1,4 +1,4 @@
-"""transforms.json: posed pictures as nerfstudio, instant-ngp and NeRF's Blender sets write them (x right, y up, z back; z up)."""
+"""transforms.json: posed pictures of nerfstudio, instant-ngp and NeRF's Blender sets (x right, y up, z back; z up)."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OP
 
 
 def read_transforms(path: Path) -> Shots:
-    """What a transforms.json, or the folder of one, says; DatasetError says what is wrong with it."""
+    """The posed pictures of a transforms.json, or of its folder; DatasetError for a broken one."""
     path = path / FILE if path.is_dir() else path
     try:
         doc = json.loads(path.read_text())
@@ -43,7 +43,7 @@ def read_transforms(path: Path) -> Shots:
 
 
 def _file(folder: Path, name: str) -> Path:
-    """The picture of that name, which Blender's sets write without its ending."""
+    """The picture of that name, which may lack its ending (as in Blender sets)."""
     file = folder / name
     if file.exists() or file.suffix.lower() in ENDINGS:
         return file

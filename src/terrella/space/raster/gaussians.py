@@ -38,25 +38,25 @@ class Gaussians:
 
     @property
     def degree(self) -> int:
-        """Of the harmonics, 0 to 3."""
+        """Degree of the harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def colours(self) -> torch.Tensor:
-        """[N, 3] in 0..1, without what depends on the direction."""
+        """[N, 3] in 0..1, without the part that depends on the direction."""
         return (0.5 + Y0 * self.sh[:, 0]).clamp(0, 1)
 
     def at(self, index: torch.Tensor) -> Gaussians:
-        """Those of the numbers, or of the mask, `index`."""
+        """The Gaussians at `index`, numbers or a mask."""
         return self.each(lambda part: part[index])
 
     def each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Gaussians:
-        """Every part changed alike."""
+        """`change` applied to every part."""
         return replace(self, **{field.name: change(getattr(self, field.name)) for field in fields(self)})
 
 
 def join(parts: Sequence[Gaussians]) -> Gaussians:
-    """All of several scenes in one; of the highest degree among them."""
+    """Several scenes in one, with the highest degree among them."""
     many = max(part.sh.shape[1] for part in parts)
     whole = [
         replace(part, sh=torch.cat([part.sh, part.sh.new_zeros(len(part), many - part.sh.shape[1], 3)], 1))

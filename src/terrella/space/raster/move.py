@@ -1,4 +1,4 @@
-"""Gaussians moved, turned and scaled as a whole, their harmonics with them."""
+"""Moves, rotates and scales scenes of Gaussians, with their harmonics."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def quaternion_of(rot: torch.Tensor) -> torch.Tensor:
 
 
 def _turned_sh(sh: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
-    """Harmonics [N, K, 3] of a scene that was turned: those that give along rot d what these give along d, by least squares."""
+    """Harmonics [N, K, 3] of a rotated scene, whose values along rot d equal those of `sh` along d, by least squares."""
     many = sh.shape[1]
     if many == 1:
         return sh

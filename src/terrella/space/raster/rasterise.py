@@ -92,7 +92,7 @@ class _Draw(torch.autograd.Function):
 
 
 class _View:
-    """A camera as the kernels take it: `lens` = its place [3], rotation [3, 3], and fx, fy, cx, cy in pixels, width, height."""
+    """A camera for the kernels: `lens` = its place [3], rotation [3, 3], and fx, fy, cx, cy in pixels, width, height."""
 
     def __init__(self, pose: torch.Tensor, camera: Intrinsics | None, size: tuple[int, int], near_m: float):
         height, width = self.size = size
@@ -105,7 +105,7 @@ class _View:
 
 
 def _project(parts, view: _View) -> tuple[np.ndarray, np.ndarray]:
-    """The splats in sight [V, SPLAT], the nearest first, and which Gaussians they are [V]."""
+    """The visible splats [V, SPLAT], nearest first, and the indices of their Gaussians [V]."""
     total, threads = len(parts[0]), torch.get_num_threads()
     splats = np.empty((total, kernels.SPLAT), np.float32)
     which, depths = np.empty(total, np.int32), np.empty(total, np.float32)
@@ -128,7 +128,7 @@ def _project(parts, view: _View) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _tiles(splats: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
-    """Which splats each tile shows, the nearest first: `items`, those of tile t from starts[t] to starts[t + 1]."""
+    """The splats of each tile, nearest first: `items`, those of tile t from starts[t] to starts[t + 1]."""
     (height, width), threads = view.size, torch.get_num_threads()
     many = -(-height // tiles.TILE) * -(-width // tiles.TILE)
     bounds = [len(splats) * part // threads for part in range(threads + 1)]

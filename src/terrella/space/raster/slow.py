@@ -1,4 +1,4 @@
-"""The slow, obvious twin of rasterise.py, for tests: every Gaussian at every pixel, in plain tensor algebra."""
+"""The slow twin of rasterise.py, for tests: every Gaussian at every pixel, in plain tensor algebra."""
 
 import math
 
@@ -63,7 +63,7 @@ def _pinhole(local: torch.Tensor, lens, size: tuple[int, int]):
 
 
 def _panorama(local: torch.Tensor, size: tuple[int, int]):
-    """The same of a picture of all directions."""
+    """The same for a picture of all directions."""
     height, width = size
     d, left, up = local.unbind(1)
     flat2 = d * d + left * left
