@@ -62,9 +62,7 @@ class _View:
 
 
 class Explorer:
-    """A policy that covers a world.
-
-    In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places, mixed with random moves; it
+    """A policy that covers a world. In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places, mixed with random moves; it
     walks up to `things`, shoots at them with ATTACK, and presses USE at obstacles. In other worlds it explores by visit counts
     (act/count_based.py, to which `log` and `recall` belong).
     """
@@ -164,9 +162,8 @@ class _Walk:
         return view.yaw + float(view.bearing[int(torch.multinomial(likelihood, 1, generator=self.rng))])
 
     def fight(self, view: _View) -> _Moves:
-        """Turns to the nearest object at eye height and shoots at it, standing, strafing or walking, the trigger held or pressed at
-        times. One fight of five only aims, and one of three aims beside the object, sometimes barely: so recordings separate the
-        effect of a hit from that of a shot, and of a shot from that of aiming."""
+        """Turns to the nearest object at eye height and shoots at it. One fight of five only aims, and one of three aims beside it,
+        so that recordings separate the effects of aiming, of a shot and of a hit."""
         ways = (), (), (), ("MOVE_LEFT",), ("MOVE_RIGHT",), ("MOVE_FORWARD",), ("MOVE_BACKWARD",)
         along = ways[random_int(self.rng, 0, 6)]
         often = (0.0, 0.3, 0.8, 1.0, 1.0)[random_int(self.rng, 0, 4)]

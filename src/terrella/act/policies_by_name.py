@@ -29,9 +29,8 @@ POLICY_NAMES = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "
     "FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by random ones"
 )
-_SETTINGS = {
-    field.name: type(field.default) if isinstance(field.default, str | int) else float for field in fields(SearchConfig)
-}
+_DEFAULTS = {field.name: field.default for field in fields(SearchConfig)}
+_SETTINGS = {name: type(value) if isinstance(value, str | int) else float for name, value in _DEFAULTS.items()}
 
 
 class NoisyPolicy:

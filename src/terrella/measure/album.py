@@ -37,10 +37,7 @@ class Album:
         return Album([(cache.rgb[first:stop], cache.pose[first:stop], number) for number, (first, stop) in ranges])
 
     def nearest(self, pose: torch.Tensor, not_episode: torch.Tensor | None = None) -> torch.Tensor:
-        """Rows of the nearest views to poses [M, 7], long [M]; -1 if none is near enough.
-
-        not_episode [M]: an episode to leave out for each pose.
-        """
+        """Rows of the nearest views to poses [M, 7], long [M]; -1 if none is near enough. not_episode [M]: episodes left out."""
         rows = []
         for start in range(0, len(pose), 64):
             part = pose[start : start + 64].float()

@@ -165,12 +165,11 @@ def _add_usable(
     whole.curves.append(Curve(*where, arm, motion, curve.x, curve.band, mark or None))
 
 
-def _long_missing(exam: Exam, world) -> str:
-    return "" if exam.sets.get(LONG) else "needs longer clips"
-
-
 def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
     """The drift probe, of all series of the other probes."""
+
+    def missing(exam: Exam, world: object) -> str:
+        return "" if exam.sets.get(LONG) else "needs longer clips"
 
     def drift_report(exam: Exam, results: ExamResults) -> ProbeReport:
         parts = [drift(exam, results, some) for some in series_of]
@@ -182,4 +181,4 @@ def drift_probe(series_of: Sequence[SeriesOf]) -> Probe:
         "The same at every step of longer clips. A dot marks the last step at which the squared error is within twice that of the "
         "first step (the curve has fallen by 3 dB); the table adds the same threshold from the first step of copy-last."
     )
-    return Probe("drift", "How far can it be used?", lead, _long_missing, drift_report)
+    return Probe("drift", "How far can it be used?", lead, missing, drift_report)

@@ -20,10 +20,7 @@ _MIN_GROUPS, _MAX_GROUPS = 8, 50  # of the jackknife: fewer give no reliable int
 
 
 def frechet(real: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
-    """Squared Frechet distance of features [..., n, D] and [..., m, D]: float64 [...], uncorrected, never below 0.
-
-    Unbiased covariances; no matrix is inverted, so sets smaller than D are allowed (but see the bias above).
-    """
+    """Squared Frechet distance of features [..., n, D] and [..., m, D]: float64 [...], uncorrected, never below 0."""
     real, dreamt = real.double(), dreamt.double()
     return frechet_of_moments(*_moments(real), *_moments(dreamt))
 

@@ -130,9 +130,8 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
 
 def _first(rows: Sequence[Row]) -> list[Row]:
     """The rows of the main channel at the first horizon."""
-    return [
-        row for row in rows if (row.channel, row.what, row.horizon) == (rows[0].channel, rows[0].what, rows[0].horizon)
-    ]
+    kinds = [(row.channel, row.what, row.horizon) for row in rows]
+    return [row for row, kind in zip(rows, kinds) if kind == kinds[0]]
 
 
 def _sure(row: Row, low: float, high: float, *words: str) -> tuple[int, str]:
@@ -170,10 +169,8 @@ def _by_place(texts: Iterable[tuple[str, str]]) -> str:
 
 
 def _line(rows: Sequence[Row]) -> str:
-    mine, copied = (
-        " / ".join(f"{figure.value:.3g}" for figure in figures)
-        for figures in ([row.figure for row in rows], [row.baselines[COPY_LAST] for row in rows])
-    )
+    mine = " / ".join(f"{row.figure.value:.3g}" for row in rows)
+    copied = " / ".join(f"{row.baselines[COPY_LAST].value:.3g}" for row in rows)
     verdicts = [gain_verdict(row.gain) for row in rows]
     about = f"{rows[0].channel} {rows[0].what}, {place_label(rows[0].place)}: {mine} {rows[0].unit}".rstrip()
     unanimous = verdicts[0] if len(set(verdicts)) == 1 else ", ".join(verdicts)

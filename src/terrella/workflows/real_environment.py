@@ -67,10 +67,8 @@ def check_alike(world: Spec, real: Spec) -> None:
 def meaning_difference(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> str:
     """How the meanings of two worlds' actions differ, by their facts (data/channels.py): mode, frame, order of the axes, units.
     "" where all that both declare agrees. The sizes of units may differ: a weaker motor is a gap to measure."""
-    mode, frame, names, units = (
-        tuple(facts.get(f"action_{what}") or "" for facts in (mine, theirs))
-        for what in ("mode", "frame", "names", "units")
-    )
+    kinds = ("mode", "frame", "names", "units")
+    mode, frame, names, units = (tuple(one.get(f"action_{kind}") or "" for one in (mine, theirs)) for kind in kinds)
     if all(mode) and mode[0] != mode[1] and "axes" not in mode:  # "axes" does not say what the numbers are
         return f"{mode[0]} and {mode[1]}"
     if all(frame) and frame[0] != frame[1]:

@@ -98,9 +98,8 @@ class UNet(nn.Module):
     """Predicts the clean frame from noise and the conditioning (flow matching, x-prediction).
 
     Each pixel is a mixture of the warped colours, the carried last frame and a colour of the net's own, so that what is known
-    stays as sharp as it was seen. A 2x pixel-unshuffle at the start makes it four times as cheap.
-    With `residual` a frame is the newest one plus the net's change: where few pixels ever change, a mixture soon copies, and
-    then no gradient corrects it.
+    stays as sharp as it was seen. With `residual` a frame is the newest one plus the net's change: where few pixels ever change,
+    a mixture soon copies, and then no gradient corrects it.
     """
 
     kind = "unet"

@@ -95,7 +95,7 @@ class FrameOutcome(nn.Module):
     """A small convolutional network over the frames before and after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values of the recording (two-hot, as in Dreamer 3). A reward is the
-    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end depends on the vitals after it.
+    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end depends on the vitals, too.
     """
 
     kind = "frames"

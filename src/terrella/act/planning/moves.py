@@ -1,8 +1,7 @@
 """Plans coded as numbers that a search can sample, mix and narrow, for continuous and for discrete actions alike.
 
-A plan is coded as float [H, D]: continuous actions as values between -1 (lower limit) and 1 (upper limit), discrete actions as
-the number of each choice. The sampling distribution of a search is a tensor [B, H, D, K]: mean and standard deviation of a
-continuous action (K = 2), or the probabilities of K choices. It is called `belief`.
+A plan is coded as float [H, D]: continuous actions from -1 to 1 between their limits, discrete ones as the number of each choice.
+`belief` [B, H, D, K] is a search's distribution: mean and standard deviation (K = 2), or the probabilities of K choices.
 """
 
 import math

@@ -135,10 +135,10 @@ class Planner:
                 )
         new = [entry for entry, episode in enumerate(memory) if episode.prior is None]
         old = [entry for entry, episode in enumerate(memory) if episode.prior is not None]
-        parts = [
-            self._fold({name: value[entries] for name, value in evidence.items()}, [memory[at] for at in entries])
-            for entries in filter(None, (new, old))
-        ]
+        parts = []
+        for entries in filter(None, (new, old)):
+            evident = {name: value[entries] for name, value in evidence.items()}
+            parts.append(self._fold(evident, [memory[at] for at in entries]))
         return State.stack(parts).at([(new + old).index(entry) for entry in range(len(memory))])
 
     def _fold(self, shown: Observation, episodes: Sequence[PlannerMemory]) -> State:

@@ -19,8 +19,7 @@ _TRUSTED_SHARE = 0.5  # of the candidates that must be within `trust` for a move
 class EpisodeSeeds:
     """Runs a verb of a world on a batch of episodes so that each draws as it would alone, from a generator of its own seed.
 
-    A verb that draws nothing runs once on the whole batch; one that draws runs episode by episode. Which of both holds is found
-    out on the first episode and remembered by the verb's name.
+    A verb that draws nothing, as its first run shows, runs once on the whole batch; one that draws runs episode by episode.
     """
 
     def __init__(self) -> None:
