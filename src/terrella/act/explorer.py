@@ -62,10 +62,9 @@ class _View:
 
 
 class Explorer:
-    """A policy that covers a world. In worlds with depth, pose and Doom's six movement buttons it walks to the least visited places, mixed with random moves; it
-    walks up to `things`, shoots at them with ATTACK, and presses USE at obstacles. In other worlds it explores by visit counts
-    (act/count_based.py, to which `log` and `recall` belong).
-    """
+    """A policy that covers a world. In worlds with depth, pose and Doom's six movement buttons it walks to the least visited
+    places, mixed with random moves, up to `things`, at which it shoots (ATTACK), and through doors (USE). In other worlds it
+    explores by visit counts (act/count_based.py, to which `log` and `recall` belong)."""
 
     def __init__(self, spec: Spec, log: Path | None = None):
         self.spec = spec

@@ -1,7 +1,5 @@
-"""The last two frames carried into a view by their own depth, and which pixels of a frame stand still.
-
-Keyframes hold what stands still; monsters, shots and doors are known from the last frames alone.
-"""
+"""The last two frames carried into a view by their own depth, and which pixels of a frame stand still: keyframes hold those,
+and monsters, shots and doors are known from the last frames alone."""
 
 from typing import NamedTuple
 

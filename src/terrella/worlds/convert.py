@@ -21,11 +21,8 @@ RETIRED = ("own_keyframes",)  # settings that no longer exist
 
 
 def convert_world(old: str | Path, new: str | Path) -> None:
-    """Writes the world in the folder `old`, of format version 2, to the new folder `new`. Weights are copied, and the remembered
-    pictures stay byte for byte.
-
-    CheckpointError where `old` is no such world, or `new` holds files.
-    """
+    """Writes the world in the folder `old`, of format version 2, to the new folder `new`; pictures stay byte for byte.
+    CheckpointError where `old` is no such world, or `new` holds files."""
     old, new = Path(old), Path(new)
     about = read_about(old)
     if (about.get("kind"), about.get("version")) != (OLD_KIND, OLD_VERSION):

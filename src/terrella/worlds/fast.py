@@ -48,10 +48,7 @@ EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
 
 def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     """The world with the faster of two ways of drawing, and which it is: eager torch, or ONNX Runtime on a CPU and a compiled
-    graph on a GPU. Frames that need a gradient are always drawn by eager torch.
-
-    TerrellaError where ONNX Runtime is not installed.
-    """
+    graph on a GPU. Frames that need a gradient are drawn by eager torch. TerrellaError where ONNX Runtime is not installed."""
     generator: nn.Module = copy.deepcopy(world.generator)
     if isinstance(generator, Codec):
         raise TerrellaError(
