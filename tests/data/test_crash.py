@@ -163,7 +163,7 @@ def test_an_interrupt_within_a_row_does_not_shift_the_frames(tmp_path, monkeypat
         patch.setattr("terrella.data.recorder.Mp4Writer.add", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             recorder.add({"rgb": np.zeros((16, 16, 3), np.uint8), "pose": np.full(7, 9)}, [0.0])
-    with pytest.raises(DatasetError, match="keeps the 4 rows"):
+    with pytest.raises(DatasetError, match="keeps 4 rows"):
         recorder.add({"rgb": np.zeros((16, 16, 3), np.uint8), "pose": np.full(7, 9)}, [0.0])
     recorder.close()
     found = Dataset(tmp_path).episode(0)
