@@ -29,7 +29,7 @@ from ..source import Lazy
 
 _RUN = struct.Struct(">II")  # flags and frames of a fragment's run
 _FIELDS = (0x100, 0x200, 0x400, 0x800)  # optional fields of a run, four bytes a frame each
-_LARGEST = 1 << 24  # bytes of one fragment's table
+_TABLE_BYTES = 1 << 24  # bytes of one fragment's table
 
 
 def _check_boxes(path: Path) -> None:
@@ -43,7 +43,7 @@ def _checked(path: str, size: int, _changed_ns: int) -> None:
     with open(path, "rb") as file:
         for at, length, kind in _walk(file, size):
             if kind == b"moof":
-                if length > _LARGEST:
+                if length > _TABLE_BYTES:
                     raise ValueError(f"a fragment's table claims {length:,} bytes")
                 _fragment(file, at, min(at + length, size), size)
 
@@ -116,7 +116,7 @@ _CODEC["tune"] = "fastdecode,zerolatency"  # no frame waits in the encoder for l
 _GROWING = {"movflags": "frag_every_frame+empty_moov+default_base_moof", "flush_packets": "1"}
 FINISHED = {"movflags": "+faststart"}  # the index in front: a cut file still plays up to the cut
 _WAITING = 64  # frames that may wait for the encoder; then `add` blocks, and no frame is dropped
-_LARGEST = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
+_PICTURE_PIXELS = 64_000_000  # pixels of a picture; a file that claims more is damaged or hostile
 
 
 @dataclass
@@ -239,7 +239,7 @@ def decode_frames(path: Path, first: int, count: int, fps: float, deep: bool = F
     try:
         with open_video(path) as (container, stream):
             limit_pixels(stream)
-            if stream.width * stream.height > _LARGEST:
+            if stream.width * stream.height > _PICTURE_PIXELS:
                 raise broken_video(path, f"it claims pictures of {stream.height}x{stream.width}")
             frames_a_tick = frames_per_tick(stream, fps)
             stream.thread_count = 1  # several episodes are decoded at once, each in a thread of its own
@@ -267,7 +267,7 @@ def limit_pixels(stream) -> None:
     """Makes the decoder refuse pictures of absurd size; ValueError where there is no decoder."""
     if stream.codec_context is None:
         raise ValueError("it is of an unknown codec")
-    stream.codec_context.options = {"max_pixels": str(_LARGEST)}
+    stream.codec_context.options = {"max_pixels": str(_PICTURE_PIXELS)}
 
 
 class Frames(Lazy):
