@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from tests.worlds.test_history import made
+from tests.worlds.test_frame_history import made
 
 import terrella
 from terrella.core import Camera, Spec, State, check_world, make_rng
