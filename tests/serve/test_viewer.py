@@ -257,7 +257,7 @@ def test_an_export_that_left_something_out_says_so(tmp_path):
     with asked(browse, export_to=tmp_path / "good") as client:
         client.post("/export")
         text = settled(client)["text"]
-    assert text.startswith("2 episodes written") and "from 4" in text and "take 1 was left out" in text
+    assert text.startswith("2 episodes written") and "of 4 marked good" in text and "take 1 was left out" in text
 
 
 def test_an_export_that_fails_is_told(tmp_path):
