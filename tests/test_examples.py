@@ -41,6 +41,7 @@ def test_hello(tmp_path):
         assert picture.size == (5 * 128, 3 * 96)
 
 
+@pytest.mark.slow
 def test_one_planner_balances_by_the_truth_and_by_a_learned_world():
     survived = example("01_random_shooting.py")["main"]()
     assert survived["at random"] < 40

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from terrella.workflows import practise
 from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule
 
@@ -22,6 +24,7 @@ SHORT = {
 }
 
 
+@pytest.mark.slow
 def test_the_guides_code_runs_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shares = {RECORDING: 60.0, TRAINING: 1.0, SCORING: 1.0}  # recording ends with its frames, training with its steps

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from gymnasium import spaces
 
@@ -26,6 +27,7 @@ def _walk(seed: int, steps: int):
     return np.stack(places), np.stack(actions)
 
 
+@pytest.mark.slow
 def test_it_covers_a_maze_and_uses_every_button():
     visited, used = set(), np.zeros(6)
     for seed in range(6):

@@ -18,6 +18,8 @@ from pathlib import Path
 import pytest
 from damage import IN_FLIGHT, KINDS, LENGTHS, OF_EPISODE, make
 
+pytestmark = pytest.mark.slow  # a sweep: `make test-all` runs it
+
 SECONDS = 60.0  # that one case may take before it counts as a hang
 LAST = 64 << 10  # bytes of each file that are cut one by one
 WHOLE = os.environ.get("TERRELLA_DAMAGE") == "all"

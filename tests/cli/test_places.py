@@ -12,6 +12,8 @@ from PIL import Image
 import terrella
 from terrella.cli import main
 
+pytestmark = pytest.mark.slow  # a sweep: `make test-all` runs it
+
 LAYOUT = {"rooms": [{"name": "hall", "at": [0, 0], "size": [6, 4, 3]}], "start": [1, 2, 0],
           "things": [{"label": "crate", "at": [3, 2]}]}  # fmt: skip
 

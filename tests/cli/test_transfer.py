@@ -109,6 +109,7 @@ def own_arm(folder, name, *changes: tuple[str, str]):
     return f"mujoco:{folder / name}.xml"
 
 
+@pytest.mark.slow
 def test_files_of_ones_own_that_tell_their_task_are_carried_over(tmp_path, capsys, few):
     mine, other = own_arm(tmp_path, "mine"), own_arm(tmp_path, "other", ('gear="8"', 'gear="7"'))
     (tmp_path / "gap.toml").write_text("delay = 1")
@@ -140,6 +141,7 @@ def test_an_unknown_parameter_of_the_gap_is_named(tmp_path, capsys):
     assert code == 2 and "no parameter 'fricton'" in err and "friction" in err
 
 
+@pytest.mark.slow
 def test_policies_are_told_their_goal_by_a_camera(tmp_path, capsys, few, monkeypatch):
     from terrella.core.errors import TerrellaError
     from terrella.core.world import make_rng

@@ -52,6 +52,7 @@ def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, nev
     assert not list((tmp_path / "temporary").glob("terrella-*"))  # nothing is left among temporary files
 
 
+@pytest.mark.slow
 def test_what_was_stopped_goes_on(tmp_path, never):
     def stop(done, total):
         if done == 2:
@@ -63,6 +64,7 @@ def test_what_was_stopped_goes_on(tmp_path, never):
     assert_same(gathered(tmp_path / "set", LocalWorkers(1)), never)
 
 
+@pytest.mark.slow
 def test_what_fails_in_a_worker_is_said(tmp_path):
     with pytest.raises(TerrellaError, match="this policy fails. 0 episodes are safe"):
         gathered(tmp_path / "set", LocalWorkers(1), failing)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from terrella.learn.feeds import RandomBatches
@@ -26,6 +27,7 @@ def test_gradients_are_turned_round():
     assert x.grad is not None and x.grad.tolist() == [-1.5, -1.5]
 
 
+@pytest.mark.slow
 def test_an_encoder_reads_where_a_spot_is(tmp_path):
     shown, at = spots(256, 0)
     torch.manual_seed(0)

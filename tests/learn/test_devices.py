@@ -6,7 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 
+
+@pytest.mark.slow
 def test_no_tensors_of_two_devices_meet():
     program = Path(__file__).parent / "another_device.py"
     ran = subprocess.run([sys.executable, program], capture_output=True, text=True, timeout=300)

@@ -80,6 +80,7 @@ def walks(episodes: int = 90, length: int = 40) -> Recording:
     return Recording(cache, np.arange(total) // length * length, np.ones(total, bool))  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_drag_thrust_turning_and_body_come_out_of_the_recording(tmp_path):
     torch.manual_seed(0)
     motion = Motion(MotionConfig(actions=3, history=2))

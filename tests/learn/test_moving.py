@@ -28,6 +28,8 @@ from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.objects import GOING, LOOK, NONE, NUMBER, RESTED, ROWS
 
+pytestmark = pytest.mark.slow  # a sweep: `make test-all` runs it
+
 
 def now(seed: int) -> TrainStep:
     return TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(seed), make_rng(seed))

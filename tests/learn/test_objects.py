@@ -16,6 +16,8 @@ from terrella.space.billboards import PICTURE, paint_billboards
 from terrella.space.camera import planar_pose
 from terrella.worlds.objects import LOOK, NUMBER, PLACE, Billboards, BillboardsConfig
 
+pytestmark = pytest.mark.slow  # a sweep: `make test-all` runs it
+
 CAMERA, SIZE = (0.5, 0.8, 0.5, 0.5), (48, 64)
 EPISODES, LENGTH, STEP_M = 30, 16, 0.1
 

@@ -106,6 +106,7 @@ def test_levels_and_shares_are_those_of_the_recording(learned):
     assert len(many) <= 33 and list(many) == sorted(set(many))
 
 
+@pytest.mark.slow
 def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
     cache, seen, happened, outcome = learned
     for first, stop in list(cache.episodes)[20:]:
@@ -117,6 +118,7 @@ def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
         assert ((found["done"] > 0.5) == cache.done[steps]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_rollouts")
 def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_path):
     config = TrainConfig(

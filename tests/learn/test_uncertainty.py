@@ -165,6 +165,7 @@ def test_a_stopped_training_of_an_uncertainty_goes_on_exactly(corridor, bare, se
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_world_without_geometry_is_given_an_uncertainty(flat_run):
     world = load_world(flat_run[0] / "world")
     assert "uncertainty" in world.spec.channels and world.spec.card["uncertainty"] == flat_run[1]["uncertainty"]

@@ -78,6 +78,7 @@ def test_every_figure_of_likeness_stands_beside_what_knows_nothing(card):
     assert all("copy last" in r.baselines for r in card.rows if r.probe == "pixels" and r.what in ("SSIM", "sharpness"))
 
 
+@pytest.mark.slow
 def test_a_world_that_stands_still_is_said_to_move_too_little(card, clips):
     moving = [row(card, "change per step", "perfect", horizon).figure.value for horizon in (1, 8, 32)]
     assert moving == pytest.approx([1, 1, 1], abs=0.02)

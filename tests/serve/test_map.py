@@ -86,6 +86,7 @@ def inside(page) -> np.ndarray:
     return np.array(data, np.uint8).reshape(*size, 4)[..., :3]
 
 
+@pytest.mark.slow
 def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 100)]).url)
     until(page, f"terrella.map.shown && terrella.map.places === {SLOTS}")

@@ -212,6 +212,7 @@ def test_parameters_that_would_do_nothing_are_not_offered():
     assert "strength" not in load("mujoco:ant", cameras=()).parameters  # no actuator of its is limited
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_looks_differ_by_world_and_change_nothing_else(tmp_path):
     """Each alone: drawn again the same, at nothing as in the file, bodies where they were."""

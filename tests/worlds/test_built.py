@@ -186,6 +186,7 @@ def test_one_knows_where_one_can_walk_to_and_a_goal_in_another_room_is_walked_to
     assert not ((places[:, :2] - torch.tensor([3.0, 1.2])).norm(dim=1) < 0.5).any(), "not in the table"
 
 
+@pytest.mark.slow
 def test_a_goal_in_another_room_is_walked_to(tmp_path, capsys):
     (tmp_path / "layout.json").write_text(json.dumps({**LAYOUT, "start": [5.6, 2.5, 0]}))
     built = ["--gaussians", "1000", "--size", "24", "32"]

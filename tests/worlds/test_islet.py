@@ -44,6 +44,7 @@ def test_the_picture_scrolls_as_it_is_told(world, action, way):
     assert len(moved) > 10 and (moved == torch.tensor(way)).all(1).float().mean() > 0.7
 
 
+@pytest.mark.slow
 def test_standing_still_it_neither_fades_nor_blurs(world):
     seen = walked(world, "noop", 120)
     first, last = (picture.float() for picture in (seen[0], seen[-1]))
