@@ -26,6 +26,7 @@ def few(monkeypatch):
     monkeypatch.setattr(transfer_arms, "GATHER", 2)
 
 
+@pytest.mark.slow
 def test_a_pair_is_carried_over_and_goes_on_where_it_was(tmp_path, capsys, few):
     asked = [
         "transfer",

@@ -43,6 +43,7 @@ def assert_same(found: Dataset, never: Dataset) -> None:
     assert np.array_equal(found.rgb_at(rows), never.rgb_at(rows))
 
 
+@pytest.mark.slow
 def test_workers_record_what_one_process_does_when_some_are_killed(tmp_path, never, monkeypatch):
     (tmp_path / "deaths").mkdir()
     (tmp_path / "temporary").mkdir()

@@ -94,6 +94,7 @@ def test_it_is_no_file_for_other_programs_which_is_said(made, capsys, tmp_path):
     assert "is a policy for goals" in capsys.readouterr().err and not (tmp_path / "goals.onnx").exists()
 
 
+@pytest.mark.slow
 def test_episodes_at_once_have_their_own_goals_and_do_what_each_would_alone(made):
     world, actor = Told(), GoalActor.load(made[0] / "run", Told().spec)
     goals = torch.tensor([[3.0, -2.0], [-4.0, 1.0], [0.0, 0.0]])

@@ -79,6 +79,7 @@ def test_keys_are_mapped_by_a_few_labelled_frames(recording, run):
     assert keys.code_of(np.array([1, 1, 1, 1])) is None
 
 
+@pytest.mark.slow
 def test_a_labelled_copy_has_codes_for_actions(recording, run, tmp_path):
     told = write(run, recording, tmp_path / "copy").facts
     copy, original = Dataset(tmp_path / "copy"), Dataset(recording)

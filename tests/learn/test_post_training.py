@@ -74,6 +74,7 @@ def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(student_ru
     assert list(out.glob("strip-*.png"))
 
 
+@pytest.mark.slow
 def test_a_stopped_distillation_goes_on_exactly(corridor, teacher, student_run, tmp_path):
     resumes_exactly(lambda out: distil(teacher, corridor, out, STUDENT, quiet), student_run[0], tmp_path, {"distil": 0})
 
@@ -92,6 +93,7 @@ def test_a_student_of_dreams_with_a_teacher_goes_on_exactly(corridor, teacher, s
     goes_on_exactly(train, tmp_path / "a", tmp_path / "b", {"dreams": 0})
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(corridor, teacher, places, dreams_run):
     with pytest.raises(TrainingError, match="other settings"):
         train_dreams(teacher, corridor, dreams_run[0], replace(DREAMS, horizon=2), quiet)
@@ -100,7 +102,8 @@ def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(c
 
 
 @pytest.mark.parametrize("kind, data, seed", [("teacher", "corridor", 0), ("places", "corridor", 0),
-                                              ("places", "corridor", 1), ("moving", "haunted", 0)])  # fmt: skip
+                                              ("places", "corridor", 1),
+                                              pytest.param("moving", "haunted", 0, marks=pytest.mark.slow)])  # fmt: skip
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
     world = tame(request.getfixturevalue(kind))
     pair = open_paired(world, request.getfixturevalue(data), None, quiet)
@@ -138,6 +141,7 @@ def test_a_teacher_may_watch_the_dreams(corridor, teacher, student, places, tmp_
         train_dreams(student, corridor, tmp_path / "run", DREAMS, quiet, places)
 
 
+@pytest.mark.slow
 def test_a_world_in_which_things_move_learns_from_its_dreams(haunted, moving, tmp_path):
     assert moving.config.moving
     train_dreams(moving, haunted, tmp_path, DREAMS, quiet)

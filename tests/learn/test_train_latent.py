@@ -75,6 +75,7 @@ def run(vectors, tmp_path_factory):
     return out, facts
 
 
+@pytest.mark.slow
 def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
     train_latent(vectors, tmp_path, replace(QUICK, rollout=5), quiet)
     world = terrella.load(tmp_path)

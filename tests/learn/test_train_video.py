@@ -52,6 +52,7 @@ def test_a_stopped_run_goes_on_exactly(corridor, bare_run, tmp_path):
     resumes_exactly(lambda out: train_video(corridor, out, BARE, quiet), bare_run[0], tmp_path, {"flow": 1})
 
 
+@pytest.mark.slow
 def test_a_stopped_run_without_geometry_goes_on_exactly(corridor, flat_run, tmp_path):
     resumes_exactly(lambda out: train_video(corridor, out, FLAT, quiet), flat_run[0], tmp_path, {"flow": 0})
 

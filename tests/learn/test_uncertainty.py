@@ -158,6 +158,7 @@ def test_dreams_are_those_of_the_seed_and_of_all_kinds(corridor, bare):
     assert first[2].episode.tolist() == [4, 5] * 3
 
 
+@pytest.mark.slow
 def test_a_stopped_training_of_an_uncertainty_goes_on_exactly(corridor, bare, sensing, tmp_path):
     resumes_exactly(
         lambda out: train_uncertainty(bare, corridor, out, SensesConfig(2, 60), quiet),

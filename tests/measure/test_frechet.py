@@ -240,6 +240,7 @@ def looks(card, arm: str):
     return card.find("pixels", "Frechet distance", arm=arm, motion="predicted")
 
 
+@pytest.mark.slow
 def test_the_scorecard_praises_the_perfect_world_and_finds_out_the_fading_one(card):
     perfect, fading, static = (
         [row.figure.value for row in looks(card, arm)] for arm in ("perfect", "fading", "static")

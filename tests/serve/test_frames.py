@@ -47,6 +47,7 @@ def test_a_frame_is_what_the_rasteriser_draws_after_the_edits():
     assert picture(frames.draw(view()))[..., 0].mean() > 3 * picture(frames.draw(view()))[..., 1].mean()
 
 
+@pytest.mark.slow
 def test_what_lies_ahead_is_in_the_middle():
     ahead = torch.tensor([[math.cos(0.7) * math.cos(0.4), math.sin(0.7) * math.cos(0.4), math.sin(0.4)]])
     one = world(300).gaussians.at(torch.arange(1))

@@ -46,6 +46,7 @@ def test_a_saved_state_goes_on_as_the_console_would_have(breakout, tmp_path):
     assert not torch.equal(state["rgb"], played(breakout, serve + hands[:-1])["rgb"])
 
 
+@pytest.mark.slow
 def test_losing_all_lives_is_told_and_ends_the_game(breakout):
     state, rng, lives = breakout.start(1, make_rng(3)), make_rng(0), []
     for step in range(600):
@@ -66,6 +67,7 @@ def test_small_pictures_are_the_mean_of_the_screen():
     assert (played(small, [0] * 25)["rgb"][0].double() - mean).abs().max() <= 1.01  # rounded twice
 
 
+@pytest.mark.slow
 def test_with_sticky_actions_states_are_tickets():
     world = AtariWorld("ALE/Breakout-v5", sticky=0.25)
     assert not world.spec.forkable

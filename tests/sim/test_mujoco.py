@@ -319,6 +319,7 @@ drawn.wait()
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_drew_in_another_thread_ends_in_silence():
     drawn_or_skipped(load("mujoco:ant", size=(24, 32))).close()
     ended = subprocess.run([sys.executable, "-c", DRAWN_ASIDE], capture_output=True, text=True, timeout=120)

@@ -34,6 +34,7 @@ def pair():
     return sim, collect(real, Random(sim.spec, (1, 9)), 6, 3)
 
 
+@pytest.mark.slow
 def test_identification_finds_what_differs(pair):
     from terrella.sim.identification import identify
     from terrella.sim.randomised import Distribution, Randomised
@@ -59,6 +60,7 @@ def test_a_residual_of_few_episodes_puts_others_right(pair, tmp_path):
     check_world(model)
 
 
+@pytest.mark.slow
 def test_play_is_learned_from_few_episodes(tmp_path):
     from terrella.sim.corrected import residual_targets
     from terrella.sim.randomised import Distribution, Randomised

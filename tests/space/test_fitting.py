@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from terrella.space.camera import planar_pose
@@ -34,6 +35,7 @@ def views(count=20) -> PosedViews:
     return PosedViews(rgb, seen.depth / seen.alpha.clamp_min(0.5), pose, LENS)
 
 
+@pytest.mark.slow
 def test_a_fit_learns_and_goes_on_exactly():
     all_views = views()
     held = torch.arange(20) % 5 == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from terrella.space.fitting import psnr
@@ -30,6 +31,7 @@ def fed(scene, weight, spare, seen):
     return scene
 
 
+@pytest.mark.slow
 def test_what_is_missing_appears_and_what_was_right_stays():
     seen, whole = views(), room()
     half = whole.at(whole.means[:, 0] < 2)

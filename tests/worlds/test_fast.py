@@ -63,7 +63,7 @@ def walk(world, batch: int, steps: int):
         yield state
 
 
-@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_one_frame_is_that_of_eager_torch(worlds, batch):
     eager, quick = worlds
     noisy, time, conditioning = example_inputs(eager)
@@ -98,6 +98,7 @@ def test_every_kind_of_generator_is_drawn_alike(kind):
             torch.testing.assert_close(quick(*inputs), generator(*inputs), atol=2e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_dream_of_32_steps_is_that_of_eager_torch(worlds):
     off = [
         (one["rgb"].int() - other["rgb"].int()).abs() for one, other in zip(*(walk(world, 2, 32) for world in worlds))
