@@ -139,3 +139,33 @@ def test_what_is_not_finite_is_left_out(tmp_path):
         read_scene(tmp_path / "a.ply")
     with pytest.raises(DatasetError, match="ends so"):
         write_scene(scene, tmp_path / "a.glb")
+
+
+COLOURS = {
+    "floats to 1": ("red green blue", "<f8", [0.8, 0.4, 0.2]),
+    "floats to 255": ("r g b", "<f4", [204.0, 102.0, 51.0]),
+    "16 bits": ("diffuse_red diffuse_green diffuse_blue", ">u2", [52428, 26214, 13107]),
+    "bytes": ("red green blue", "u1", [204, 102, 51]),
+    "integers to 255": ("red green blue", "<i4", [204, 102, 51]),
+}
+
+
+@pytest.mark.parametrize("kind", COLOURS)
+def test_colours_of_points_of_any_type(tmp_path, kind):
+    names, dtype, colour = COLOURS[kind]
+    dtype = np.dtype(dtype)
+    order = ">" if dtype.byteorder == ">" else "<"
+    axes = [(axis, f"{order}f4") for axis in "xyz"]
+    rows = np.zeros(50, [*axes, *((name, dtype) for name in names.split()), ("alpha", "u1")])
+    for axis in "xyz":
+        rows[axis] = np.random.default_rng(ord(axis)).normal(size=50)
+    for name, value in zip(names.split(), colour):
+        rows[name] = value
+    rows["alpha"], rows["alpha"][0] = 255, 51
+    types = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
+    head = f"ply\nformat binary_{'big' if order == '>' else 'little'}_endian 1.0\nelement vertex 50\n"
+    head += "".join(f"property {types[rows.dtype[name].str[1:]]} {name}\n" for name in rows.dtype.names)
+    (tmp_path / "a.ply").write_bytes(head.encode() + b"end_header\n" + rows.tobytes())
+    scene = read_scene(tmp_path / "a.ply")
+    assert torch.allclose(scene.colours, torch.tensor([0.8, 0.4, 0.2]).expand(50, 3), atol=1e-4)
+    assert scene.opacities[1] == pytest.approx(0.9) and scene.opacities[0] == pytest.approx(0.18)

@@ -16,6 +16,7 @@ from terrella.space.fitting import PosedViews
 from terrella.space.pictures import is_pictures, posed_pictures
 from terrella.space.pictures.posed import to_views
 from terrella.space.pictures.reading import blurred, read_picture, sharpness
+from terrella.space.pictures.transforms import read_transforms
 from terrella.space.raster import rasterise
 from terrella.space.stereo import with_depth
 
@@ -141,6 +142,80 @@ def test_blur_is_told_from_little_to_see():
     assert blurred([sharpness(one) for one in (sharp, faint, sharp, shaken)]) == [False, False, False, True]
 
 
+def listed(folder, *names, **top):
+    """A transforms.json that lists these names."""
+    frames = [{"file_path": name, "transform_matrix": np.eye(4).tolist()} for name in names]
+    folder.mkdir(exist_ok=True)
+    (folder / "transforms.json").write_text(
+        json.dumps({"fl_x": 60, "w": 64, "h": 48, **top, "frames": frames}), "utf-8-sig"
+    )
+
+
+def saved(folder, *names):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (64, 48), (90, 90, 90)).save(folder / name)
+
+
+PLY = "ply\nformat {} 1.0\nelement vertex 2\n{}end_header\n"
+PLY_XYZ = "".join(f"property double {axis}\n" for axis in "xyz")
+POINTS = {
+    "text": PLY.format("ascii", PLY_XYZ + "element face 1\nproperty list uchar int v\n").encode()
+    + b"1 2 3\r\n\r\n4 5 6\r\n3 0 1 1",
+    "big endian": PLY.format("binary_big_endian", PLY_XYZ).encode() + np.arange(1, 7).astype(">f8").tobytes(),
+}
+
+
+@pytest.mark.parametrize("kind", POINTS)
+def test_known_points_in_any_form_of_ply(tmp_path, kind):
+    saved(tmp_path, "a.png")
+    (tmp_path / "points.ply").write_bytes(POINTS[kind])
+    listed(tmp_path, "a.png", ply_file_path="points.ply")
+    shots = read_transforms(tmp_path)
+    assert shots.points.tolist() == [[1, 2, 3], [4, 5, 6]] and not shots.left_out
+
+
+def test_help_that_is_absent_or_broken_is_left_out_by_name(tmp_path):
+    saved(tmp_path, "a.png", "c.png")
+    (tmp_path / "points.ply").write_bytes(b"ply\nnothing of the kind")
+    listed(tmp_path, "a.png", "b.png", "c.png", ply_file_path="points.ply")
+    shots, out = posed_pictures(tmp_path, tmp_path / "work", 100)
+    assert [file.name for file in shots.files] == ["a.png", "c.png"] and len(shots.pose) == len(shots.lenses) == 2
+    assert out == ["points.ply (its header has no end)", "b.png (absent)"]
+    listed(tmp_path, "a.png", ply_file_path="gone.ply")
+    assert read_transforms(tmp_path).left_out == ("gone.ply (absent)",)
+    with pytest.raises(DatasetError, match="b.png is not there"):
+        read_picture(tmp_path / "b.png")
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("images\\my picture.png", "images/my picture.png"),
+        ("images/my%20picture.png", "images/my picture.png"),
+        (r"C:\Users\me\set\images\a.png", "images/a.png"),
+        ("/home/me/set/images/a.png", "rgb/a.png"),
+        ("./images/A.JPG", "images_2/a.jpg"),
+        ("./train/r_0", "train/r_0.png"),
+    ],
+)
+def test_names_of_other_machines(tmp_path, name, place):
+    saved(tmp_path, place, "masks/a.png", "depth/a.png")
+    listed(tmp_path, name)
+    assert read_transforms(tmp_path).files == [tmp_path / place]
+
+
+def test_a_picture_of_another_name_is_not_taken_for_one_that_is_absent(tmp_path):
+    saved(tmp_path, "left/1.png", "right/1.png", "right/2.png")
+    listed(tmp_path, "left/1.png", "right/1.png", "left/2.png", "right/2.png", "left/3.png", "right/3.png")
+    shots = read_transforms(tmp_path)
+    assert len(shots.files) == 3 and shots.left_out == tuple(
+        f"{one} (absent)" for one in ("left/2.png", "left/3.png", "right/3.png")
+    )
+    saved(tmp_path, "other/3.png")
+    assert len(read_transforms(tmp_path).files) == 3
+
+
 def bad_json(folder, doc):
     (folder / "transforms.json").write_text('{"frames": [')
 
@@ -161,8 +236,9 @@ def unknown_model(folder, doc):
     doc["camera_model"] = "ORTHOPHOTO"
 
 
-def lost(folder, doc):
-    (folder / "003.png").unlink()
+def all_lost(folder, doc):
+    for file in folder.glob("*.png"):
+        file.unlink()
 
 
 def no_picture(folder, doc):
@@ -199,7 +275,7 @@ def wrong_poses(folder, doc):
         (not_finite, "003.png: its pose is no rotation"),
         (no_focus, "no sensible size or focal length"),
         (unknown_model, "ORTHOPHOTO"),
-        (lost, "003.png cannot be read as a picture"),
+        (all_lost, "none of its 20 pictures is there, such as 000.png"),
         (no_picture, "003.png cannot be read as a picture"),
         (cut, "003.png cannot be read as a picture"),
         (tiny, "003.png is 5 x 5 pixels"),

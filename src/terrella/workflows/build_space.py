@@ -28,6 +28,7 @@ from .progress import Progress, silent, stage
 from .splat_places import SpaceResult, page_scene
 
 LAYOUT_FILE = "layout.json"
+MOST_NAMES = 20  # of what is left out on one line
 WALKER = Walker(eye_m=1.65, step_m=0.35)  # in places that are built
 
 
@@ -70,8 +71,9 @@ def fit_space(
         f"{copied:.1f} (+-{copied_by:.1f})",
         f"walk in it: terrella play {facts['world']}",
     ]
-    if facts["left_out"]:
-        lines.append(f"left out, blurred or without overlap: {', '.join(facts['left_out'])}")
+    if left_out := facts["left_out"]:
+        more = f", and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
+        lines.append(f"left out (blurred, without overlap, or as named): {', '.join(left_out[:MOST_NAMES])}{more}")
     return SpaceResult(facts, tuple(lines))
 
 

@@ -1,5 +1,8 @@
 """PLY: its header and tables (hostile ones are rejected), and Gaussians as in 3D Gaussian Splatting's code and gsplat."""
 
+import re
+from itertools import takewhile
+
 import numpy as np
 import torch
 
@@ -7,40 +10,59 @@ from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
 
 LONGEST_HEADER, MOST = 1 << 16, 1 << 24
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
-    "double": "<f8", "float64": "<f8",
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
+    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 def parse(data: bytes) -> dict[str, np.ndarray]:
-    """The elements of a binary PLY as structured arrays; ValueError for anything else."""
-    end = data.find(b"end_header\n", 0, LONGEST_HEADER)
-    windows = data.find(b"end_header\r\n", 0, LONGEST_HEADER)
-    if end < 0 and windows < 0:
+    """The elements of a PLY (binary or ASCII) as structured arrays, up to the first one with lists (faces), which is left out with
+    all behind it; ValueError for anything else."""
+    mark = re.search(rb"end_header[ \t]*\r?\n?", data[:LONGEST_HEADER])
+    if mark is None:
         raise ValueError("its header has no end")
-    body = end + 11 if end >= 0 else windows + 12
-    lines = [line.split() for line in data[:body].decode("ascii", "replace").splitlines()]
-    if ["format", "binary_little_endian", "1.0"] not in lines:
-        raise ValueError("it is not binary_little_endian")
+    lines = [line.split() for line in data[: mark.start()].decode("ascii", "replace").splitlines()]
+    form = next((words[1] for words in lines if len(words) == 3 and words[0] == "format"), "")
+    if form not in _ORDERS:
+        raise ValueError("it states no format of PLY")
     tables: list[tuple[str, int, list[tuple[str, str]]]] = []
     for words in lines:
         if words[:1] == ["element"]:
             if len(words) != 3 or not words[2].isdigit() or not int(words[2]) <= MOST:
                 raise ValueError(f"its element line '{' '.join(words)[:80]}' counts no sensible number")
             tables.append((words[1], int(words[2]), []))
+        elif words[:2] == ["property", "list"] and tables and len(words) == 5:
+            tables[-1][2].append((words[4], ""))
         elif words[:1] == ["property"]:
             if len(words) != 3 or words[1] not in _TYPES or not tables or len(tables[-1][2]) >= 1000:
                 raise ValueError(f"its property line '{' '.join(words)[:80]}' is not understood")
-            tables[-1][2].append((words[2], _TYPES[words[1]]))
+            tables[-1][2].append((words[2], _ORDERS[form] + _TYPES[words[1]]))
+    plain = list(takewhile(lambda table: all(kind for _, kind in table[2]), tables))
+    kinds = [(name, count, np.dtype(columns)) for name, count, columns in plain]  # ValueError for columns of one name
+    return _rows_of_text(data[mark.end() :], kinds) if form == "ascii" else _rows(data, mark.end(), kinds)
+
+
+def _rows(data: bytes, at: int, kinds: list[tuple[str, int, np.dtype]]) -> dict[str, np.ndarray]:
     elements = {}
-    for name, count, columns in tables:
-        kind = np.dtype(columns)  # ValueError for columns of one name
-        if body + count * kind.itemsize > len(data):
+    for name, count, kind in kinds:
+        if at + count * kind.itemsize > len(data):
             raise ValueError(f"it ends before its {count:,} rows of '{name}' do")
-        elements[name] = np.frombuffer(data, kind, count, body)
-        body += count * kind.itemsize
+        elements[name] = np.frombuffer(data, kind, count, at)
+        at += count * kind.itemsize
+    return elements
+
+
+def _rows_of_text(data: bytes, kinds: list[tuple[str, int, np.dtype]]) -> dict[str, np.ndarray]:
+    lines = [line for line in data.decode("ascii", "replace").splitlines() if line.strip()]
+    elements, first = {}, 0
+    for name, count, kind in kinds:
+        if first + count > len(lines):
+            raise ValueError(f"it ends before its {count:,} rows of '{name}' do")
+        rows = np.loadtxt(lines[first : first + count], kind, ndmin=1) if count else np.empty(0, kind)
+        elements[name], first = rows, first + count
     return elements
 
 
@@ -51,11 +73,14 @@ def decode(elements: dict[str, np.ndarray]) -> Gaussians:
         raise ValueError("it holds no points")
     means = columns(rows, "x", "y", "z")
     if "scale_0" not in (rows.dtype.names or ()):
-        colours = columns(rows, "red", "green", "blue") / 255
+        names = rows.dtype.names or ()
+        colours = shares(rows, *next((three for three in _COLOURS if set(three) <= set(names)), _COLOURS[0]))
+        solid = shares(rows, "alpha")[:, 0] if "alpha" in names else torch.ones(len(rows))
+        solid = solid if solid.any() else torch.ones(len(rows))  # some tools leave it 0
         spread = (means.amax(0) - means.amin(0)).norm() / max(len(rows), 1) ** 0.5
         scales = torch.full((len(rows), 3), float(spread) * 0.4)
         quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(rows), 1)
-        return Gaussians(means, quats, scales, torch.full((len(rows),), 0.9), plain_sh(colours))
+        return Gaussians(means, quats, scales, 0.9 * solid, plain_sh(colours))
     rest = [name for name in rows.dtype.names or () if name.startswith("f_rest_")]
     many = {0: 1, 9: 4, 24: 9, 45: 16}.get(len(rest))
     if many is None:
@@ -75,6 +100,21 @@ def columns(rows: np.ndarray, *names: str) -> torch.Tensor:
         raise KeyError(", ".join(missing))
     with np.errstate(over="ignore", invalid="ignore"):
         return torch.from_numpy(np.stack([rows[name].astype(np.float32) for name in names], 1))
+
+
+def shares(rows: np.ndarray, *names: str) -> torch.Tensor:
+    """Colours or opacities [n, names] in 0..1, whatever their type. Full are 1, 255 or 65,535 of floats, and 255, 65,535 or the
+    largest number of their type of integers: the first that holds all values."""
+    values, kind = columns(rows, *names), rows.dtype[names[0]]
+    most = float(values.nan_to_num(0, 0, 0).amax())
+    if kind.kind == "f":
+        full = next(
+            (level for level in (1.0, 255.0, 65535.0) if most <= 1.5 * level), most
+        )  # some are slightly too bright
+    else:
+        largest = float(np.iinfo(kind).max)
+        full = next(level for level in (255.0, min(65535.0, largest), largest) if most <= level)
+    return (values / full).clamp(0, 1)
 
 
 def encode(gaussians: Gaussians) -> bytes:

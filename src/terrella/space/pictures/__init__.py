@@ -27,7 +27,7 @@ def is_pictures(path: Path) -> bool:
 
 
 def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str]]:
-    """At most `frames` pictures with poses, and the names of those left out. Missing poses are computed by COLMAP; pictures and
+    """At most `frames` pictures with poses, and what was left out, by name. Missing poses are computed by COLMAP; pictures and
     model stay in `work` for the next call."""
     if path.name == transforms.FILE or (path / transforms.FILE).exists():
         shots, out = transforms.read_transforms(path), []
@@ -41,7 +41,7 @@ def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str
         names = {file.name for file in shots.files}
         out = sorted(file.name for file in _pictures(work / "images") if file.name not in names)
     rows = np.linspace(0, len(shots.files) - 1, min(frames, len(shots.files))).round().astype(int)
-    return shots.at(rows.tolist()), out
+    return shots.at(rows.tolist()), [*out, *shots.left_out]
 
 
 def _stage(path: Path, work: Path, frames: int) -> int:

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from ...core.errors import DatasetError
-from .posed import Lens, Shots, levelled, pose_of
+from .locating import locate
+from .posed import Lens, Shots, absent, levelled, pose_of
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "0", ".")
 _MANY = 120  # pictures; of more, each is compared with its successors alone
@@ -41,19 +42,26 @@ def read_colmap(folder: Path) -> Shots:
     except (RuntimeError, ValueError, MemoryError) as error:
         raise DatasetError(f"{model} cannot be read as a model of COLMAP; make it again.") from error
     lenses = {number: _lens(camera) for number, camera in model_data.cameras.items()}
-    homes = [home for home in (folder / "images", folder, model.parent.parent / "images") if home.is_dir()]
+    homes = [home for home in (folder / "images", model.parent.parent / "images", folder) if home.is_dir()]
     placed = sorted((one for one in model_data.images.values() if one.has_pose), key=lambda one: one.name)
-    files, poses = [], []
-    for image in placed:
-        files.append(next((f for home in homes if (f := home / image.name).is_file()), homes[0] / image.name))
+    if not placed:
+        raise DatasetError(f"{model} places no picture; make it again.")
+    located = list(zip(placed, locate(homes, [one.name for one in placed])))
+    kept = [(image, file) for image, file in located if file is not None]
+    if not kept:
+        raise DatasetError(
+            f"none of the {len(placed)} pictures of {model} is in {folder}, such as {placed[0].name}; add them."
+        )
+    poses = []
+    for image, _ in kept:
         pose = image.cam_from_world().inverse().matrix()
         rot = np.stack([pose[:, 2], -pose[:, 0], -pose[:, 1]], 1)
         poses.append(pose_of(rot, pose[:, 3], f"{model}: {image.name}"))
-    if not placed:
-        raise DatasetError(f"{model} places no picture; make it again.")
     points = np.array([point.xyz for point in model_data.points3D.values()], np.float32).reshape(-1, 3)
     points = torch.from_numpy(points[np.isfinite(points).all(1)])
-    return levelled(Shots(files, [lenses[one.camera_id] for one in placed], torch.stack(poses), points, False))
+    files, own = [file for _, file in kept], [lenses[image.camera_id] for image, _ in kept]
+    missing = tuple(absent(image.name) for image, file in located if file is None)
+    return levelled(Shots(files, own, torch.stack(poses), points, False, missing))
 
 
 def _lens(camera: Any) -> Lens:

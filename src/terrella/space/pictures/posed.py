@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -48,17 +48,24 @@ class Lens:
 
 @dataclass(frozen=True)
 class Shots:
-    """files and lenses of pictures; pose [T, 7], our frame; known points float32 [N, 3]; metric: whether the unit is a metre."""
+    """files and lenses of pictures; pose [T, 7], our frame; known points float32 [N, 3]; metric: whether the unit is a metre;
+    left_out: what of the files was absent or is not read."""
 
     files: list[Path]
     lenses: list[Lens]
     pose: torch.Tensor
     points: torch.Tensor
     metric: bool
+    left_out: tuple[str, ...] = ()
 
     def at(self, rows: list[int]) -> Shots:
         files, lenses = [self.files[k] for k in rows], [self.lenses[k] for k in rows]
-        return Shots(files, lenses, self.pose[rows], self.points, self.metric)
+        return replace(self, files=files, lenses=lenses, pose=self.pose[rows])
+
+
+def absent(name: str) -> str:
+    """How a file is named that is listed and not there."""
+    return f"{name} (absent)"
 
 
 def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
@@ -81,7 +88,7 @@ def levelled(shots: Shots) -> Shots:
     scale = MIDDLE_M / max(float(torch.cdist(place, some).median()), 1e-6)
     middle = place.median(0).values
     pose = torch.cat([(place - middle) * scale, multiply_quaternions(quaternion_of(rot), shots.pose[:, 3:])], 1)
-    return Shots(shots.files, shots.lenses, pose, (points - middle) * scale, False)
+    return replace(shots, pose=pose, points=(points - middle) * scale, metric=False)
 
 
 def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:

@@ -32,6 +32,8 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
                 picture = ImageOps.exif_transpose(opened) if upright else opened.copy()
     except DatasetError:
         raise
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is not there; put it back, or take it off the list.") from error
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         raise DatasetError(
             f"{path} cannot be read as a picture; save it again as JPEG or PNG, or take it away."

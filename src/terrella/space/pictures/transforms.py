@@ -9,23 +9,32 @@ import torch
 
 from ...core.errors import DatasetError
 from ..files import ply
-from .posed import Lens, Shots, pose_of
-from .reading import ENDINGS, read_picture
+from .locating import locate
+from .posed import Lens, Shots, absent, pose_of
+from .reading import read_picture
 
 FILE = "transforms.json"
+_BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 
 
 def read_transforms(path: Path) -> Shots:
-    """The posed pictures of a transforms.json, or of its folder; DatasetError for a broken one."""
+    """The posed pictures of a transforms.json, or of its folder, without those that are absent; DatasetError for a broken one."""
     path = path / FILE if path.is_dir() else path
     try:
-        doc = json.loads(path.read_text())
+        doc = json.loads(path.read_text("utf-8-sig"))
         frames = list(doc["frames"])
+        if not frames:
+            raise ValueError("it lists no frames")
+        names = [str(frame["file_path"]) for frame in frames]
+        located = locate((path.parent,), names)
+        if not any(located):
+            raise ValueError(f"none of its {len(frames)} pictures is there, such as {names[0]}")
         cameras: dict[tuple[Any, ...], Lens] = {}
         files, lenses, poses = [], [], []
-        for frame in frames:
-            file = _file(path.parent, str(frame["file_path"]))
+        for frame, file in zip(frames, located):
+            if file is None:
+                continue
             matrix = np.array(frame["transform_matrix"], float)
             if matrix.shape not in ((4, 4), (3, 4)):
                 raise ValueError(f"the pose of {file.name} is no 4 x 4 matrix")
@@ -33,26 +42,32 @@ def read_transforms(path: Path) -> Shots:
             poses.append(pose_of(rot, matrix[:3, 3], f"{path}: {file.name}"))
             files.append(file)
             lenses.append(_lens(doc | frame, file, cameras))
-        if not frames:
-            raise ValueError("it lists no frames")
-        points = _points(path.parent / doc["ply_file_path"]) if "ply_file_path" in doc else torch.zeros(0, 3)
+        points, left_out = _points(path.parent, doc.get("ply_file_path"))
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} cannot be read as posed pictures: {reason}; write it again.") from error
-    return Shots(files, lenses, torch.stack(poses), points, True)
-
-
-def _file(folder: Path, name: str) -> Path:
-    """The picture of that name, which may lack its ending (as in Blender sets)."""
-    file = folder / name
-    if file.exists() or file.suffix.lower() in ENDINGS:
-        return file
-    return next((one for end in ENDINGS if (one := file.with_name(file.name + end)).exists()), file)
+    left_out += [absent(name) for name, file in zip(names, located) if file is None]
+    for key, what in (("mask_path", "masks"), ("depth_file_path", "depth pictures")):
+        if many := sum(bool(frame.get(key)) for frame in frames):
+            left_out.append(f"{many} {what} ({key}), which are not read")
+    return Shots(files, lenses, torch.stack(poses), points, True, tuple(left_out))
 
 
 def _lens(frame: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens]) -> Lens:
     """The lens of a frame; the same one for the same numbers."""
-    names = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2", "camera_model")
+    names = (
+        "w",
+        "h",
+        "fl_x",
+        "fl_y",
+        "cx",
+        "cy",
+        "camera_angle_x",
+        "camera_angle_y",
+        *_BENDS,
+        "camera_model",
+        "is_fisheye",
+    )
     key = tuple(frame.get(name) for name in names)
     if key not in cameras:
         model = str(frame.get("camera_model", "OPENCV"))
@@ -60,16 +75,22 @@ def _lens(frame: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens
             raise ValueError(f"cameras of the model {model} are not known, only {', '.join(_MODELS)}")
         height, width = (frame["h"], frame["w"]) if "w" in frame and "h" in frame else read_picture(file).shape[:2]
         width, height = int(width), int(height)
-        fx = frame["fl_x"] if "fl_x" in frame else 0.5 * width / np.tan(0.5 * float(frame["camera_angle_x"]))
-        focal = [float(v) for v in (fx, frame.get("fl_y", fx), frame.get("cx", width / 2), frame.get("cy", height / 2))]
-        bend = {name: float(frame.get(name) or 0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
+        fx = _focal(frame, "fl_x", "camera_angle_x", width)
+        fy = _focal(frame, "fl_y", "camera_angle_y", height) if {"fl_y", "camera_angle_y"} & frame.keys() else fx
+        focal = [float(v) for v in (fx, fy, frame.get("cx", width / 2), frame.get("cy", height / 2))]
+        bend = {name: float(frame.get(name) or 0) for name in _BENDS}
         if min(width, height) < 8 or not all(map(np.isfinite, [*focal, *bend.values()])) or min(focal[:2]) <= 0:
             raise ValueError(f"the camera of {file.name} has no sensible size or focal length")
-        fisheye = model == "OPENCV_FISHEYE"
+        fisheye = model == "OPENCV_FISHEYE" or bool(frame.get("is_fisheye"))
         cameras[key] = Lens(
             width, height, (focal[0], focal[1], focal[2], focal[3]), lambda at: _opencv(at, focal, bend, fisheye)
         )
     return cameras[key]
+
+
+def _focal(frame: dict[str, Any], focal: str, angle: str, side: int) -> float:
+    """Pixels, stated, or of the angle of view of a side."""
+    return float(frame[focal]) if focal in frame else 0.5 * side / float(np.tan(0.5 * float(frame[angle])))
 
 
 def _opencv(at: np.ndarray, focal: list[float], k: dict[str, float], fisheye: bool) -> np.ndarray:
@@ -88,5 +109,15 @@ def _opencv(at: np.ndarray, focal: list[float], k: dict[str, float], fisheye: bo
     return bent * focal[:2] + focal[2:]
 
 
-def _points(path: Path) -> torch.Tensor:
-    return ply.columns(ply.parse(path.read_bytes())["vertex"], "x", "y", "z")
+def _points(folder: Path, name: Any) -> tuple[torch.Tensor, list[str]]:
+    """Known points [N, 3], and the file of points if it is of no use."""
+    if not name:
+        return torch.zeros(0, 3), []
+    file = next((one for one in (folder / str(name), folder / str(name).replace("\\", "/")) if one.is_file()), None)
+    try:
+        if file is None:
+            return torch.zeros(0, 3), [absent(str(name))]
+        points = ply.columns(ply.parse(file.read_bytes())["vertex"], "x", "y", "z")
+        return points[points.isfinite().all(1)], []
+    except (OSError, ValueError, KeyError) as error:
+        return torch.zeros(0, 3), [f"{name} ({error})"]
