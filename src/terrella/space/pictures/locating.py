@@ -19,8 +19,8 @@ def locate(homes: Sequence[Path], names: Sequence[str]) -> list[Path | None]:
         for name in names
     ]
     if None in files:
-        moved, taken = _by_tail(homes[-1]), set(files)
-        guesses = [None if file else _moved(name, moved, taken) for file, name in zip(files, names)]
+        tails, taken = _by_tail(homes[-1]), set(files)
+        guesses = [None if file else _relocated(name, tails, taken) for file, name in zip(files, names)]
         count = Counter(guesses)
         files = [file or (guess if count[guess] == 1 else None) for file, guess in zip(files, guesses)]
     return files
@@ -50,10 +50,10 @@ def _by_tail(home: Path) -> dict[str, list[Path]]:
     return tails
 
 
-def _moved(name: str, moved: dict[str, list[Path]], taken: set[Path | None]) -> Path | None:
+def _relocated(name: str, tails: dict[str, list[Path]], taken: set[Path | None]) -> Path | None:
     parts = [part for part in _spellings(name)[-1].casefold().split("/") if part not in ("", ".", "..")]
     for first in range(len(parts)):
-        files = [file for file in moved.get("/".join(parts[first:]), ()) if file not in taken]
+        files = [file for file in tails.get("/".join(parts[first:]), ()) if file not in taken]
         if files:
             return files[0] if len(files) == 1 else None
     return None
