@@ -66,6 +66,30 @@ def test_the_options_are_as_promised(command, capsys):
         assert len(text.strip()) > 10, f"{option.split()[0]} says nothing"
 
 
+@pytest.mark.parametrize(
+    "command", ["plan", "play", "evaluate", "train latent", "train policy", "data merge", "space build"]
+)
+def test_help_names_values_and_gives_only_defaults_that_are_values(command, capsys):
+    shown = help_of(command, capsys)
+    assert not re.search(r"default: (None|False|True|''|)\)|\bSTR\b|\{None|config\.", shown), shown
+    assert not re.search(r"^ +--no-[\w-]+ *$\n\s*(--|$)", shown, re.MULTILINE), "every flag is described"
+    assert shown.startswith(f"usage: terrella {command} ") and all(len(line) <= 110 for line in shown.splitlines())
+
+
+def test_a_flag_is_described_as_what_it_does(capsys):
+    shown = " ".join(help_of("plan", capsys).split())
+    assert "--no-curve Do not plan again" in shown
+    assert "--no-memory Play a learned world without its keyframes." in " ".join(help_of("play", capsys).split())
+    for name in ("pictures", "vectors"):
+        assert f"--no-{name} Observe the recording's" in " ".join(help_of("train latent", capsys).split())
+
+
+def test_help_and_version_are_commands_too(capsys):
+    assert help_of("data doctor", capsys) == (main(["help", "data", "doctor"]), capsys.readouterr().out)[1]
+    assert main(["help"]) == 0 and "terrella data doctor" in capsys.readouterr().out
+    assert main(["version"]) == 0 and capsys.readouterr().out == f"terrella {terrella.__version__}\n"
+
+
 def test_train_promises_its_main_options(capsys):
     shown = help_of("train video", capsys)
     for option in ("--out", "--steps", "--hours", "--device", "--seed", "--json"):
@@ -87,6 +111,7 @@ def test_the_version_is_said(capsys):
     "given, meant",
     [
         (["paly", "doom-maze"], "'play'"),
+        (["hlep"], "'help'"),
         (["data", "docter", "x"], "'doctor'"),
         (["train", "vido", "x"], "'video'"),
         (["--versoin"], "'--version'"),

@@ -152,7 +152,7 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
         patch.setattr(Trainer, "_step", interrupting)
         assert main(command(out)) == 130
     said = capsys.readouterr().err
-    assert "records for up to" in said and "the same command goes on from there" in said
+    assert "records for up to" in said and "the same command continues" in said
     assert Dataset(out / RECORDING).length == FRAMES
     assert main([*command(out), "--json"]) == 0
     told = capsys.readouterr()

@@ -310,7 +310,7 @@ def test_standing_still_must_not_fade(clips):
         assert found.pictures[0].columns[:2] == ["now", "1"] and found.rows[0].baselines["copy last"].value == 1
     config = replace(exam_of({}).config, still_steps=100)
     said = [verdict(card_of({"a": Panorama(flaw)}, {"recorded": clips}, config))[0] for flaw in ("", "fading")]
-    assert "holds still" in said[0] and "fades while nobody plays" in said[1]
+    assert "holds still" in said[0] and "fades while the agent idles" in said[1]
 
 
 def test_who_still_glides_is_held_against_where_it_comes_to_rest():

@@ -125,7 +125,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(given: list[str]) -> int:
-    if given[:1] in (["--version"], ["-V"]):
+    if given[:1] == ["help"]:  # terrella help play: terrella play --help
+        given = [*given[1:], "--help"]
+    if given[:1] in (["version"], ["--version"], ["-V"]):
         from ..version import __version__
 
         print(f"terrella {__version__}")
@@ -137,6 +139,7 @@ def _run(given: list[str]) -> int:
     import tyro
 
     from .flags import value_of_flag
+    from .help_page import help_page
 
     module, _, function = COMMANDS[name][0].partition(":")
     command: Callable[..., int | None] = getattr(import_module(f"{__name__}.{module}"), function)
@@ -144,6 +147,13 @@ def _run(given: list[str]) -> int:
         (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
         [RENAMED.get(word, word) for word in rest],
     )
+    if {"-h", "--help"} & set(words):
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # of get_parser; constraints.txt keeps a tyro that has it
+            print(help_page(tyro.extras.get_parser(command, prog=f"terrella {name}", config=markers)))
+        return 0
     try:
         return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
     except SystemExit as stop:
@@ -164,7 +174,7 @@ def _command(given: list[str]) -> tuple[str, list[str]]:
             break
         known = _members(group)
         if name not in known:
-            hint = did_you_mean(word, known)
+            hint = did_you_mean(word, known if group else (*known, "help", "version"))
             raise TerrellaError(f"there is no command '{name}'{hint or '.'} The commands are {', '.join(known)}.")
         group = name
     rest = given[len(group.split()) :]
@@ -187,8 +197,8 @@ def _help(group: str, requested: bool) -> int:
     lines = [f"usage: terrella {group + ' ' if group else ''}COMMAND ...", ""]
     lines += [] if group else [DESCRIPTION, ""]
     lines += [f"  terrella {name:<22} {words}" for name, words in shown.items()]
-    lines += ["", "`terrella COMMAND --help` explains a command and its options."]
-    lines += [] if group else ["`terrella --version` prints the version."]
+    lines += ["", "`terrella help COMMAND` explains a command and its options."]
+    lines += [] if group else ["`terrella version` prints the version."]
     print("\n".join(lines), file=sys.stdout if requested else sys.stderr)
     return 0 if requested else 2
 

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..workflows.progress import stage
-from .say import Host, Json, Port, Token, result, say
+from .say import Host, Json, Port, RecordingName, Token, result, say
 
 Fps = Annotated[float | None, arg(help="Frames per second of the new dataset. Default: those of the recording.")]
 Policy = Annotated[
@@ -32,7 +32,11 @@ def _whole_or_nothing(target: Path) -> Iterator[None]:
 
 
 def doctor(
-    folder: Positional[Path], repair: bool = False, out: Path | None = None, yes: bool = False, json: Json = False
+    folder: Annotated[Path, Positional, arg(metavar="RECORDING")],
+    repair: bool = False,
+    out: Path | None = None,
+    yes: bool = False,
+    json: Json = False,
 ) -> int:
     """Look for faults in a recording and say how to repair each.
 
@@ -81,7 +85,10 @@ class ConvertConfig:
 
 
 def convert(
-    source: Positional[str], target: Positional[Path], config: ConvertConfig = ConvertConfig(), json: Json = False
+    source: RecordingName,
+    target: Annotated[Path, Positional, arg(metavar="TARGET")],
+    config: ConvertConfig = ConvertConfig(),
+    json: Json = False,
 ) -> None:
     """Convert a recording to another format: LeRobot v3, MCAP, Minari, HDF5, rollouts (.npz), videos, images.
 
@@ -108,7 +115,7 @@ def convert(
 
 
 def merge(
-    sources: Positional[tuple[str, ...]],
+    sources: Annotated[tuple[str, ...], Positional, arg(metavar="[RECORDING ...]")],
     out: Path,
     mapping: Path | None = None,
     fps: Fps = None,
@@ -134,7 +141,7 @@ def merge(
 
 
 def view(
-    folder: Positional[str],
+    folder: RecordingName,
     rerun: bool = False,
     out: Path | None = None,
     port: Port = 8766,
@@ -168,8 +175,8 @@ def view(
 
 
 def label(
-    run: Positional[Path],
-    folder: Positional[Path],
+    run: Annotated[Path, Positional, arg(metavar="RUN")],
+    folder: Annotated[Path, Positional, arg(metavar="RECORDING")],
     out: Path,
     labelled: Path | None = None,
     frames: int = 200,

@@ -1,15 +1,16 @@
 """The commands `terrella export ...`."""
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from .. import library
 from ..core.errors import TerrellaError
 from .say import Json, result
 
 
-def policy(name: Positional[Path], world: str, out: Path, json: Json = False) -> None:
+def policy(name: Annotated[Path, Positional, arg(metavar="POLICY")], world: str, out: Path, json: Json = False) -> None:
     """Write a learned policy as one ONNX file, with normalisation and action limits inside: it runs without PyTorch.
 
     Args:

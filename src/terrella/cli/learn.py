@@ -1,6 +1,8 @@
 """The command `terrella learn`."""
 
-from tyro.conf import Positional
+from typing import Annotated
+
+from tyro.conf import Positional, arg
 
 from ..core.errors import TerrellaError
 from ..workflows import learn as world_workflow
@@ -10,7 +12,12 @@ from ..workflows.opening import ControlsConfig
 from .say import Json, say, show
 
 
-def learn(name: Positional[str], config: LearnConfig, practise: bool = False, json: Json = False) -> None:
+def learn(
+    name: Annotated[str, Positional, arg(metavar="ENVIRONMENT")],
+    config: LearnConfig,
+    practise: bool = False,
+    json: Json = False,
+) -> None:
     """Learn a world of an environment, in one go: a script explores and records it, a world is trained on that, and scored.
 
     Stop it at any time; the same command continues.

@@ -1,16 +1,14 @@
 """The command `terrella play`: a world, or a game and a world side by side, on a page in the browser."""
 
-from tyro.conf import Positional
-
 from ..core.world import World
 from ..serve import ServeConfig
 from ..workflows import play as workflow
 from ..workflows.opening import ControlsConfig
-from .say import Host, Json, Port, Seed, Token, result, say
+from .say import Host, Json, Port, Seed, Token, WorldName, result, say
 
 
 def play(
-    name: Positional[str],
+    name: WorldName,
     controls: ControlsConfig,
     config: workflow.PlayConfig,
     port: Port = 8765,
@@ -22,7 +20,7 @@ def play(
     """Play a world in the browser: a learned world or a real game.
 
     Args:
-        name: A name that `terrella list` shows, or the path of a checkpoint.
+        name: A name of `terrella list`, the path of a checkpoint or run, or an environment (gym:ID).
     """
 
     def ready(address: str, worlds: list[World]) -> None:

@@ -1,9 +1,7 @@
 """The commands `terrella record ...`."""
 
-from tyro.conf import Positional
-
 from ..workflows.collect import CollectConfig, DoomRecordConfig, collect, collect_doom
-from .say import Json, say, show
+from .say import Json, WorldName, say, show
 
 
 def record_doom(config: DoomRecordConfig, json: Json = False) -> None:
@@ -11,10 +9,10 @@ def record_doom(config: DoomRecordConfig, json: Json = False) -> None:
     show(collect_doom(config, progress=say), json)
 
 
-def record_world(name: Positional[str], config: CollectConfig, json: Json = False) -> None:
+def record_world(name: WorldName, config: CollectConfig, json: Json = False) -> None:
     """Record any world: a Gymnasium environment (gym:CartPole-v1, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or a learned world.
 
     Args:
-        name: A name that `terrella list` shows, or the path of a checkpoint.
+        name: The environment (gym:ID), a name of `terrella list`, or the path of a checkpoint or run.
     """
     show(collect(name, config, progress=say), json)

@@ -4,21 +4,31 @@ import json as json_text
 from collections.abc import Mapping
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from ..workflows.progress import Terminal
 from ..workflows.results import Result
 
+# Positional arguments, by what they name.
+WorldName = Annotated[str, Positional, arg(metavar="WORLD")]
+RecordingName = Annotated[str, Positional, arg(metavar="RECORDING")]
+PlaceName = Annotated[str, Positional, arg(metavar="PLACE")]
 Json = Annotated[bool, arg(help="Print one JSON document on stdout instead of text.")]
 Seed = Annotated[int, arg(help="The same seed gives the same result.")]
 Port = Annotated[int, arg(help="Port of the page; 0 picks a free one.")]
 Host = Annotated[
     str,
     arg(
-        help="Address to listen on. Any address but this machine's requires a token; one is generated if none is given."
+        help="Address to listen on. 0.0.0.0: other devices of the network may open the page, at the address that is printed; it "
+        "carries a token."
     ),
 ]
-Token = Annotated[str | None, arg(help="Secret that the address of the page must contain.")]
+Token = Annotated[
+    str | None,
+    arg(
+        help="Secret that the address of the page must contain; default: none, or a generated one if --host is not this machine."
+    ),
+]
 
 say = Terminal()  # the progress of every command
 

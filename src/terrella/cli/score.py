@@ -1,12 +1,10 @@
 """The command `terrella score`."""
 
-from tyro.conf import Positional
-
 from ..workflows import score as workflow
-from .say import Json, say, show
+from .say import Json, WorldName, say, show
 
 
-def score(name: Positional[str], config: workflow.ScoreConfig, json: Json = False) -> None:
+def score(name: WorldName, config: workflow.ScoreConfig, json: Json = False) -> None:
     """Compare a world's predictions with a recording: pictures, states, poses, rewards, memory, speed.
 
     Figures are saved as they are measured; the same command continues.

@@ -1,8 +1,9 @@
 """The commands `terrella space ...`: places of Gaussians, fitted to recordings, built, read from files, edited and exported."""
 
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ..learn.recipes.splat import SplatFit
 from ..serve.place_page import serve_place
@@ -16,11 +17,11 @@ from ..workflows.build_space import (
 from ..workflows.edit_space import EditSpaceConfig, edit_space
 from ..workflows.export_space import ExportSpaceConfig, export_space
 from ..workflows.splat_places import editable_place
-from .say import Host, Json, Port, Token, result, say, show
+from .say import Host, Json, PlaceName, Port, RecordingName, Token, result, say, show
 
 
 def fit(
-    data: Positional[str], out: str, config: SplatFit, watch: bool = False, port: Port = 8767, json: Json = False
+    data: RecordingName, out: str, config: SplatFit, watch: bool = False, port: Port = 8767, json: Json = False
 ) -> None:
     """Make a place to walk in from a recording or from pictures. Ctrl-C stops it at any time; the same command continues.
 
@@ -33,7 +34,13 @@ def fit(
     show(fit_space(data, out, config, watch_port=port if watch else None, progress=say), json)
 
 
-def build(layout: Positional[Path | None] = None, *, out: Path, config: BuildSpaceConfig, json: Json = False) -> None:
+def build(
+    layout: Annotated[Path | None, Positional, arg(metavar="[LAYOUT]")] = None,
+    *,
+    out: Path,
+    config: BuildSpaceConfig,
+    json: Json = False,
+) -> None:
     """Make a place to walk in from a layout.json (rooms, doors, windows, stairs, furniture), from the triangles of a .glb or
     .gltf, or from words. The same seed gives the same bytes.
 
@@ -44,7 +51,9 @@ def build(layout: Positional[Path | None] = None, *, out: Path, config: BuildSpa
     show(build_space(layout, out, config), json)
 
 
-def import_(file: Positional[Path], out: Path, config: ImportSpaceConfig, json: Json = False) -> None:
+def import_(
+    file: Annotated[Path, Positional, arg(metavar="FILE")], out: Path, config: ImportSpaceConfig, json: Json = False
+) -> None:
     """Make a world from a file of Gaussians: .ply, SuperSplat's compressed .ply, .spz of versions 1 to 4, .sog, or .glb; or from
     the triangles of a .glb or .gltf.
 
@@ -55,7 +64,12 @@ def import_(file: Positional[Path], out: Path, config: ImportSpaceConfig, json: 
     show(import_space(file, out, config, progress=say), json)
 
 
-def export(world: Positional[str], file: Positional[Path], config: ExportSpaceConfig, json: Json = False) -> None:
+def export(
+    world: PlaceName,
+    file: Annotated[Path, Positional, arg(metavar="FILE")],
+    config: ExportSpaceConfig,
+    json: Json = False,
+) -> None:
     """Write a world for other tools: Gaussians as .ply, .spz or .glb, a mesh (.glb), a panorama (.png), a film (.mp4), or a page
     (.html).
 
@@ -69,7 +83,7 @@ def export(world: Positional[str], file: Positional[Path], config: ExportSpaceCo
 
 
 def view(
-    world: Positional[str],
+    world: PlaceName,
     beside: str | None = None,
     port: Port = 8767,
     host: Host = "127.0.0.1",
@@ -92,7 +106,7 @@ def view(
     serve_place(place, port, host, token, ready)
 
 
-def edit(world: Positional[str], config: EditSpaceConfig, json: Json = False) -> None:
+def edit(world: PlaceName, config: EditSpaceConfig, json: Json = False) -> None:
     """Change a part of a world of Gaussians. Each edit is a line of its world.edits.jsonl; the scene itself stays as it was.
 
     Args:

@@ -11,20 +11,22 @@ from ..workflows.plan import plan as run_plan
 from ..workflows.plan_study import PlanConfig
 from ..workflows.transfer import TransferConfig
 from ..workflows.transfer import transfer as run_transfer
-from .say import Json, say, show
+from .say import Json, WorldName, say, show
 
 Inside = Annotated[str, arg(name="in", help="The world to evaluate them in: a name of `terrella list`, or a path.")]
 Policies = Annotated[
     tuple[str, ...],
+    Positional,
     arg(
+        metavar="[POLICY ...]",
         help="random, idle, explorer, constant:VALUE, plan, plan:samples=16,horizon=12, the folder of a learned policy, or "
-        "MODULE:NAME or FILE.py:NAME of your own. NAME@0.3 takes a random action with probability 0.3."
+        "MODULE:NAME or FILE.py:NAME of your own. NAME@0.3 takes a random action with probability 0.3.",
     ),
 ]
 STOPPED = 130
 
 
-def plan(world: Positional[str], config: PlanConfig, json: Json = False) -> int:
+def plan(world: WorldName, config: PlanConfig, json: Json = False) -> int:
     """Plan in a world, act in the real environment, and report how often that reached the goal, beside acting at random.
 
     A folder receives a page, a film of dream and reality side by side, and all figures. Ctrl-C keeps the episodes that are done.
@@ -37,7 +39,7 @@ def plan(world: Positional[str], config: PlanConfig, json: Json = False) -> int:
     return STOPPED if outcome.stopped else 0
 
 
-def evaluate(policies: Positional[Policies], inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
+def evaluate(policies: Policies, inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
     """Evaluate policies in a world and in the real environment, from the same starts: does the world rank them as reality does?
 
     A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
@@ -54,7 +56,7 @@ def transfer(config: TransferConfig, json: Json = False) -> None:
     show(run_transfer(config, progress=say), json)
 
 
-def acceleration(world: Positional[str], config: AccelerationConfig, json: Json = False) -> None:
+def acceleration(world: WorldName, config: AccelerationConfig, json: Json = False) -> None:
     """Time how fast a world imagines with a new random action at each control step, beside a simulator of the same task.
 
     Reports imagined seconds per second, joules, the usable horizon, and what share of the simulator-trained return a policy

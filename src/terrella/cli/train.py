@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining
@@ -25,10 +25,10 @@ from ..workflows.progress import Report
 from ..workflows.train import run_recipe, train_latent, train_video
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
-from .say import Json, say, show
+from .say import Json, RecordingName, WorldName, say, show
 
 
-def video(data: Positional[str], out: str, config: TrainConfig, json: Json = False) -> None:
+def video(data: RecordingName, out: str, config: TrainConfig, json: Json = False) -> None:
     """Train a playable world on a recording. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
@@ -38,7 +38,7 @@ def video(data: Positional[str], out: str, config: TrainConfig, json: Json = Fal
     show(train_video(data, out, config, progress=say), json)
 
 
-def latent(data: Positional[str], out: str, config: LatentTraining, json: Json = False) -> None:
+def latent(data: RecordingName, out: str, config: LatentTraining, json: Json = False) -> None:
     """Train a latent world on a recording with pictures, state vectors or both: it predicts a latent instead of pixels, for
     thousands of rollouts at once. Stop it with Ctrl-C at any time; the same command continues.
 
@@ -69,7 +69,7 @@ def goals(
     _shown(lambda report: train_goals(inside, world, recording, out, config, report), json, run=out)
 
 
-def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: Json = False) -> None:
+def estimator(data: RecordingName, out: str, config: EstimatorTraining, json: Json = False) -> None:
     """Train a depth and odometry estimator on a recording with depth and poses: depth from one picture, motion from two.
 
     Args:
@@ -79,7 +79,7 @@ def estimator(data: Positional[str], out: str, config: EstimatorTraining, json: 
     _shown(lambda report: train_estimator(data, out, config, report), json)
 
 
-def uncertainty(name: Positional[str], data: str, out: str, config: SensesConfig, json: Json = False) -> None:
+def uncertainty(name: WorldName, data: str, out: str, config: SensesConfig, json: Json = False) -> None:
     """Train a world's estimator, so that it can start from a single picture, and its uncertainty, the error to expect. `train
     video` ends with both.
 
@@ -91,7 +91,7 @@ def uncertainty(name: Positional[str], data: str, out: str, config: SensesConfig
     _shown(lambda report: train_uncertainty(folder_of(name), data, out, config, report), json)
 
 
-def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining, json: Json = False) -> None:
+def objects(name: WorldName, data: str, out: str, config: ObjectsTraining, json: Json = False) -> None:
     """Train a world's objects on another recording: how they look, move, change and vanish. Takes minutes.
 
     Args:
@@ -102,7 +102,7 @@ def objects(name: Positional[str], data: str, out: str, config: ObjectsTraining,
     _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json)
 
 
-def latent_actions(data: Positional[str], out: str, config: LatentActionsConfig, json: Json = False) -> None:
+def latent_actions(data: RecordingName, out: str, config: LatentActionsConfig, json: Json = False) -> None:
     """Learn a few latent actions from pictures alone. `terrella data label` then writes them into a recording.
 
     Args:
@@ -113,7 +113,7 @@ def latent_actions(data: Positional[str], out: str, config: LatentActionsConfig,
 
 
 def few_steps(
-    name: Positional[str],
+    name: WorldName,
     data: str,
     out: str,
     config: DistilConfig,
@@ -131,7 +131,7 @@ def few_steps(
 
 
 def dreams(
-    name: Positional[str],
+    name: WorldName,
     data: str,
     out: str,
     config: DreamsConfig,

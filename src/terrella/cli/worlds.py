@@ -2,13 +2,16 @@
 
 import json as json_text
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from .say import Json
 
 
-def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) -> None:
+def list_worlds(
+    folders: Annotated[tuple[Path, ...], Positional, arg(metavar="[FOLDER ...]")] = (), json: Json = False
+) -> None:
     """List the available worlds, each with its card.
 
     Args:
@@ -26,7 +29,9 @@ def list_worlds(folders: Positional[tuple[Path, ...]] = (), json: Json = False) 
             print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
 
 
-def convert_world(old: Positional[Path], new: Positional[Path]) -> None:
+def convert_world(
+    old: Annotated[Path, Positional, arg(metavar="OLD")], new: Annotated[Path, Positional, arg(metavar="NEW")]
+) -> None:
     """Convert a world of an earlier release to the format of this one. Nothing is lost.
 
     Args:

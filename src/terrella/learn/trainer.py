@@ -273,7 +273,7 @@ class Trainer:
         self.save()
         if stop.is_set():
             done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"
-            raise KeyboardInterrupt(f"{done}; the same command goes on from there.")
+            raise KeyboardInterrupt(f"{done}; the same command continues.")
 
     def _step(self, step: int) -> dict[str, float]:
         """One batch, and one gradient step for each of its losses in turn. Returns the means of the losses' parts."""

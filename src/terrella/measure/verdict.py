@@ -159,7 +159,7 @@ def _stands(row: Row) -> tuple[int, str]:
     within = SHARP_WITHIN if row.what == "sharpness" else COLOUR_WITHIN
     fading = row.what == "sharpness" and row.figure.value < 1  # else something moves, or changes colour
     words = ("may fade", "fades") if fading else ("may change", "changes")
-    return _sure(row, 1 - within, 1 + within, "holds still", *(f"{word} while nobody plays" for word in words))
+    return _sure(row, 1 - within, 1 + within, "holds still", *(f"{word} while the agent idles" for word in words))
 
 
 def _by_place(texts: Iterable[tuple[str, str]]) -> str:

@@ -175,7 +175,7 @@ def _collect_by_workers(
             collect_episodes(job, out, workers, config.episodes, upto, report)
     except KeyboardInterrupt:
         safe = len(Dataset(out).episodes) if (out / "meta" / "info.json").exists() else 0
-        raise KeyboardInterrupt(f"stopped: {safe:,} episodes are safe in {out}; the same command goes on.") from None
+        raise KeyboardInterrupt(f"stopped: {safe:,} episodes are safe in {out}; the same command continues.") from None
     return CollectResult(out, recording_facts(Dataset(out), world.spec.name, progress))
 
 

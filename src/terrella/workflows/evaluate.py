@@ -123,7 +123,7 @@ def _play(study: _Study, log: EvaluationLog, names: tuple[str, ...], episodes: i
     except KeyboardInterrupt:
         safe = min(log.count(name) for name in names)
         raise KeyboardInterrupt(
-            f"stopped: {safe} of {episodes} episodes of each policy are safe in {log.file}; the same command goes on."
+            f"stopped: {safe} of {episodes} episodes of each policy are safe in {log.file}; the same command continues."
         ) from None
     finally:
         log.save()

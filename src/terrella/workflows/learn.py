@@ -128,9 +128,7 @@ class _Learning:
                 with stage(name, progress) as shown, schedule.stage(name, shown) as report:
                     facts = work(report)
             except KeyboardInterrupt as stop:
-                raise KeyboardInterrupt(
-                    str(stop) or f"stopped while {name}; the same command goes on from there."
-                ) from stop
+                raise KeyboardInterrupt(str(stop) or f"stopped while {name}; the same command continues.") from stop
             except Exception:
                 schedule.forget()
                 raise

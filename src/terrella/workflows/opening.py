@@ -21,7 +21,7 @@ Fast = Annotated[
 
 @dataclass(frozen=True)
 class ControlsConfig:
-    """Names and keys of the actions. Default: as the world declares them."""
+    """Names and keys of the actions; default: as the world declares them."""
 
     keys: tuple[str, ...] = ()
     """Keys and their actions, by name or number: a=left d=right space=2, up+space=5 for both at once, w=0,1,0 of axes."""
@@ -41,7 +41,7 @@ class ControlsConfig:
 
 @dataclass(frozen=True)
 class EnvironmentConfig:
-    """Settings of the environment. Default: as it declares them."""
+    """Settings of the environment; default: as it declares them."""
 
     size: tuple[int, int] | None = None
     """Height and width of the pictures of a Gymnasium environment; default: as drawn, Atari 64 64."""

@@ -68,8 +68,8 @@ class PlanConfig:
     steps: int | None = None
     """Steps per episode at most; default: the environment's limit, else 200, or 30 s to walk to a place."""
     curve: bool = True
-    """Plan again with a half, a quarter, ... of --samples or --budget-ms, to see whether more compute helps. --no-curve
-    skips this."""
+    """Whether to measure how much more compute helps. --no-curve: do not plan again with a half, a quarter, ... of --samples
+    or --budget-ms."""
     out: Path | None = None  # Folder for the page, the film and plan.json; default: plans/ and the world's name.
     device: Device = "auto"
     seed: int = 0  # The same seed gives the same result.

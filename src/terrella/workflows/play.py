@@ -31,7 +31,7 @@ class PlayConfig:
     """Show the real game beside the learned world, under the same actions. --truth GAME names the game."""
     truth: str | None = None
     """The real game that --compare shows; default: the game that the world learned, else doom:my_way_home."""
-    memory: bool = True  # Use the learned world's keyframes. --no-memory plays without them.
+    memory: bool = True  # --no-memory: play a learned world without its keyframes.
     remember: bool = False  # Add a spatial memory to a world that has none.
     estimator: str | None = None
     """Depth and motion estimator for --remember: a file of `terrella train estimator`, or a world that has one."""
@@ -39,11 +39,11 @@ class PlayConfig:
     randomise: Path | None = None
     """A TOML or JSON file of distributions, from which each episode draws masses, friction, delay and more."""
     agent: str = ""
-    """Agent that drives after G is pressed: plan, explorer, random, the folder of a learned policy, or MODULE:NAME; default: a
+    """Agent that acts after G is pressed: plan, explorer, random, the folder of a learned policy, or MODULE:NAME; default: a
     planner if the world has a reward, else the explorer. A planner seeks the goals that are set on the page."""
     agent_ms: float = 30.0  # Time for a planner's decision, in milliseconds.
     policy: Literal["explore", "random"] | None = None
-    """Script that acts whenever nobody touches the controls."""
+    """Script that acts while the controls are not touched."""
     record: Path | None = None  # Folder of a dataset to which the page can record.
     device: Device = "auto"
     fast: Fast = False

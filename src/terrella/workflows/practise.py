@@ -103,7 +103,7 @@ def practise(
         try:
             done.append(_round(rounds, done, environment, real, config, progress))
         except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(str(stop) or "stopped; the same command goes on from there.") from stop
+            raise KeyboardInterrupt(str(stop) or "stopped; the same command continues.") from stop
         rounds.note(done)
         progress(_round_line(done[-1]))
     trials = {}

@@ -43,9 +43,9 @@ class LatentTraining:
     """Settings of a training run."""
 
     name: str = "latent"  # Name of the world.
-    # Observe the recording's pictures. --no-pictures observes its state vectors alone, and renders nothing.
+    # --no-pictures: observe the recording's state vectors alone; the world then renders no pictures.
     pictures: bool = True
-    # Observe the recording's state vectors. --no-vectors observes its pictures alone, and still predicts the vectors.
+    # --no-vectors: observe the recording's pictures alone; the state vectors are predicted, but not observed.
     vectors: bool = True
     # State vectors of the recording to learn, such as observation. Default: all.
     channels: tuple[str, ...] = ()
@@ -64,7 +64,7 @@ class LatentTraining:
     # Steps predicted at once (a leap), for planners that hold an action for as many steps; 0 trains none. Default: 5, if the
     # rollout is that long.
     leap: int | None = None
-    # Training steps. Training ends after these or after `hours`, whichever comes first. Default: 4000, and with pictures 2500.
+    # Training steps. Training ends after these or after --hours, whichever comes first. Default: 4000, and with pictures 2500.
     steps: int | None = None
     hours: float = 24.0  # Hours of training, earlier runs included.
     # Clips per step. Default: 128, and with pictures 32.

@@ -56,7 +56,7 @@ class Practice:
     # Coefficient of the entropy bonus, relative to the range of returns (for ppo to normalised advantages). Default: 3e-4, for
     # ppo 2e-3.
     entropy: float | None = None
-    # With continuous actions, use the world's own gradients if it is differentiable. --no-gradients uses REINFORCE.
+    # --no-gradients: with continuous actions use REINFORCE, although the world is differentiable.
     gradients: bool = True
     # Uncertainty of the world at which a rollout ends. Default: the world's own threshold for invented content, if it declares
     # one.
@@ -192,7 +192,7 @@ def _starts(
 
 
 def _inventing_level(spec: Spec) -> float | None:
-    """The uncertainty from which a world calls itself inventing; None if its card has no such level."""
+    """The uncertainty above which the content of a frame is invented, by the world's card; None if the card has no such level."""
     levels = spec.card.get("uncertainty")
     if "uncertainty" not in spec.channels or not isinstance(levels, Mapping):
         return None

@@ -75,7 +75,7 @@ def fit_splat(
         _run(fit, config, report, preview, lambda: _save(out / RESUME, fit, recipe))
     except KeyboardInterrupt:
         _save(out / RESUME, fit, recipe)
-        raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command goes on.") from None
+        raise KeyboardInterrupt(f"stopped after {fit.done} steps; the same command continues.") from None
     preview()
     figures = _figures(fit, seen, tested)
     if not finished:  # else it may have been edited since

@@ -17,7 +17,7 @@ class TrainConfig:
     name: str = "world"  # Name of the world.
     # Height and width of its frames in pixels. Default: those of the recording, scaled down to at most 96 x 128 pixels in all.
     size: tuple[int, int] | None = None
-    # Use the depth and poses of a recording that has them. --no-geometry learns from frames and actions alone.
+    # --no-geometry: learn from frames and actions alone, although the recording has depth and poses.
     geometry: bool = True
     # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88 128, and
     # without depth 48 64 96.
@@ -28,13 +28,12 @@ class TrainConfig:
     # Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a recording with object
     # instances. 0: no separate model, the generator draws them.
     objects_steps: int = 2500
-    # Learn what moves (monsters, doors, pick-ups), if a recording with depth and poses marks it. --no-moving treats everything as
-    # static.
+    # --no-moving: treat everything as static, although the recording marks what moves (monsters, doors, pick-ups).
     moving: bool = True
     # Flow steps a frame. With more than one the whole flow from noise to frame is learned, so that a frame is a sample, not a
     # mean. Such a world can be the teacher of `train distil`.
     flow_steps: int = 1
-    # Training steps of the generator. Training ends after these or after `hours`, whichever comes first.
+    # Training steps of the generator. Training ends after these or after --hours, whichever comes first.
     steps: int = 8000
     # Hours of training, of all stages together, earlier runs included; learning rates decay over them.
     hours: float = 24.0
