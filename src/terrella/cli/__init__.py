@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from typing import Any
 
 from ..core.errors import TerrellaError
 from ..core.similar import did_you_mean
@@ -152,7 +153,8 @@ def _run(given: list[str]) -> int:
             warnings.simplefilter(
                 "ignore", DeprecationWarning
             )  # of get_parser; constraints.txt keeps a tyro that has it
-            print(help_page(tyro.extras.get_parser(command, prog=f"terrella {name}", config=markers)))
+            parser: Any = tyro.extras.get_parser(command, prog=f"terrella {name}", config=markers)
+        print(help_page(parser))
         return 0
     try:
         return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
