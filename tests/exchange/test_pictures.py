@@ -99,7 +99,7 @@ def test_reading_in_order_opens_the_file_once_and_closes_it(tmp_path, monkeypatc
     (take,) = videos.read(tmp_path).takes()
     begun = []
     original = videos._decoded
-    monkeypatch.setattr(videos, "_decoded", lambda path, to: (begun.append(to), original(path, to))[1])
+    monkeypatch.setattr(videos, "_decoded", lambda path, film, to: (begun.append(to), original(path, film, to))[1])
     values = take.readings[RGB].values
     for i in range(40):
         values[i], values[i]

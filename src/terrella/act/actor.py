@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from ..core.errors import CheckpointError
-from ..core.files import replacing, write_text
+from ..core.files import remedy_of, replacing, write_text
 from ..core.spec import Spec
 from ..core.world import Observation
 from .actor_network import ActorConfig, ActorNetwork, check_seen
@@ -96,7 +96,7 @@ def write_policy(folder: str | Path, description: Mapping[str, Any], network: nn
         write_text(folder / POLICY_FILE, json.dumps(description, indent=1) + "\n")
     except (OSError, SafetensorError) as error:
         raise CheckpointError(
-            f"the policy cannot be written to {folder} ({error}); free some space, or choose another folder."
+            f"the policy cannot be written to {folder} ({error}); {remedy_of(error)}, or choose another folder."
         ) from error
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from ..core.errors import CheckpointError, TerrellaError
-from ..core.files import replacing
+from ..core.files import remedy_of, replacing
 from .actor import Actor
 
 
@@ -41,5 +41,5 @@ def write_onnx(actor: Actor, file: str | Path) -> dict[str, list[int]]:
                 dynamic_axes={name: {0: "batch"} for name in names}, dynamo=False,
             )  # fmt: skip
     except (OSError, RuntimeError) as error:
-        raise CheckpointError(f"{file} cannot be written ({error}); free some space, or choose another.") from error
+        raise CheckpointError(f"{file} cannot be written ({error}); {remedy_of(error)}, or choose another.") from error
     return {name: [-1, *shape] for name, shape in actor.network.config.sees}

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from ..core.errors import TerrellaError
+from ..core.files import remedy_of
 from ..core.similar import did_you_mean
 
 DESCRIPTION = "Learn a world from recordings, step inside it, and measure how far it can be trusted."
@@ -211,7 +212,7 @@ def _sentence(error: Exception) -> str | None:
         return str(error)
     if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
         where = f" ({error.filename})" if error.filename else ""
-        return f"{error.strerror}{where}; choose another folder, or free some space."
+        return f"{error.strerror}{where}; {remedy_of(error)}, or choose another folder."
     if isinstance(error, ModuleNotFoundError) and error.name in ("mujoco", "glfw", "OpenGL"):
         return f"{error.name} is not installed; `pip install 'terrella[mujoco]'` installs what MuJoCo's worlds need."
     if _of_a_renderer(error):

@@ -14,6 +14,7 @@ from pathlib import Path
 from .errors import DatasetError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # error numbers of a full disk
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 _STALE_S = 3600.0  # a hidden file of this age was left behind by a process that was killed
 
 
@@ -108,7 +109,15 @@ def creating(path: str | Path) -> Iterator[Path]:
 def not_written(path: Path, error: OSError) -> DatasetError:
     """The error to raise where the disk refused to write `path`, of which nothing is kept."""
     why = "the disk is full" if error.errno in FULL else error.strerror or str(error)
-    return DatasetError(f"{path} was not written: {why}; free some space, or choose another place, and try again.")
+    return DatasetError(f"{path} was not written: {why}; {remedy_of(error)}, or choose another place, and try again.")
+
+
+def remedy_of(error: BaseException) -> str:
+    """What to do after a write that failed: "free some space" only where the disk is full."""
+    number = getattr(error, "errno", None)
+    if number in FULL or f"os error {errno.ENOSPC}" in str(error):  # safetensors gives its number in words
+        return "free some space"
+    return "make that folder writable" if number in _FORBIDDEN else "check that folder and its disk"
 
 
 def _remove_stale(target: Path) -> None:

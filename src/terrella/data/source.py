@@ -64,6 +64,7 @@ class Take:
     task: str = ""  # the instruction, "" for none. Where it changes, facts["language"] is [[time_s, text], ...]
     start_ns: int | None = None  # wall-clock time of time_s = 0, nanoseconds since 1970 (UTC); None where unknown
     facts: Mapping[str, object] = field(default_factory=dict)  # further JSON values
+    notes: tuple[str, ...] = ()  # sentences about parts of it that could not be read; equal ones are listed once
 
 
 @dataclass(frozen=True)

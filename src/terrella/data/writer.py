@@ -40,6 +40,7 @@ from .format import (
     to_arrow,
 )
 from .source import Sensor
+from .storage.tables import as_local
 
 ROWS_PER_GROUP = 256
 BYTES_PER_GROUP = 1 << 25
@@ -115,14 +116,14 @@ class Writer:
             if name in draft.films:
                 staged[stream_path(name, number, "mp4")] = draft.films[name]
         staged[EPISODES_PATH.format(**file_numbers(number))] = table = self.staging / "episode.parquet"
-        pq.write_table(self._episode_table(number, draft, of_episode), table, **_CHECKED)
+        pq.write_table(self._episode_table(number, draft, of_episode), as_local(table), **_CHECKED)
         files.sync_file(table)
         for path, file in staged.items():
             files.move_into_place(file, self.root / path)
         merged = stats.merge([self._stats, of_episode])
         files.write_json(self.root / STATS, stats.to_json(merged))
         with files.replacing(self.root / TASKS) as path:
-            pq.write_table(tasks_table(tasks), path, **_CHECKED)
+            pq.write_table(tasks_table(tasks), as_local(path), **_CHECKED)
         files.write_json(self.root / INFO, self._info(number + 1, self.rows + draft.length, len(tasks)))
         self.episodes, self.rows, self._stats, self._tasks = number + 1, self.rows + draft.length, merged, tasks
         return number
@@ -194,7 +195,7 @@ class Writer:
             raise DatasetError(f"{self.root} was recorded with another layout ({what}); record to a new folder.")
         self.rows, self.episodes = info["total_frames"], info["total_episodes"]
         if self.episodes:
-            self._tasks = pq.read_table(self.root / TASKS).column("__index_level_0__").to_pylist()
+            self._tasks = pq.read_table(as_local(self.root / TASKS)).column("__index_level_0__").to_pylist()
             self._stats = stats.from_json(json.loads((self.root / STATS).read_text(encoding="utf-8")))
             if any(int(summary["count"][0]) != self.rows for summary in self._stats.values()):
                 self._stats = self._stats_of_episodes()  # the recorder was killed before info.json was replaced
@@ -202,7 +203,7 @@ class Writer:
     def _stats_of_episodes(self) -> dict[str, stats.Summary]:
         parts: dict[int, dict[str, stats.Summary]] = {}
         for file in sorted((self.root / "meta" / "episodes").glob("chunk-*/file-*.parquet")):
-            for row in pq.read_table(file).to_pylist():
+            for row in pq.read_table(as_local(file)).to_pylist():
                 part = parts.setdefault(row["episode_index"], {})
                 for name, value in row.items():
                     if name.startswith("stats/"):
@@ -217,7 +218,7 @@ class Writer:
         index = {task: number for number, task in enumerate(tasks)}
         task = np.array([index[each] for each in draft.tasks or [draft.task] * draft.length], np.int64)
         options = {**_CHECKED, "compression_level": 3, "use_dictionary": False}
-        with pq.ParquetWriter(file, self.schema, **options) as table:
+        with pq.ParquetWriter(as_local(file), self.schema, **options) as table:
             for group in draft.rows:
                 columns = dict(group)
                 left = range(min(ROWS_PER_GROUP, draft.length - done))
@@ -244,7 +245,7 @@ class Writer:
     def _stage_stream(self, sensor: Sensor, readings: Iterable[tuple[float, np.ndarray | None]]) -> Path:
         file = self.staging / f"stream-{sensor.name}.parquet"
         form = stream_schema(sensor)
-        with pq.ParquetWriter(file, form, **_CHECKED) as table:
+        with pq.ParquetWriter(as_local(file), form, **_CHECKED) as table:
             readings = iter(readings)
             while group := list(_some(readings)):
                 columns: list[pa.Array] = [pa.array([time_s for time_s, _ in group], pa.float64())]
@@ -284,13 +285,13 @@ class Writer:
 
 def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:
     """Merges tables of episodes into the first; after a killed merge, the first has some of the rows already."""
-    table = pa.concat_tables([pq.ParquetFile(file).read() for file in tables], promote_options="default")
+    table = pa.concat_tables([pq.ParquetFile(as_local(file)).read() for file in tables], promote_options="default")
     table = table.take(np.unique(table["episode_index"].to_numpy(), return_index=True)[1])
     for key, value in at.items():
         place = table.schema.get_field_index(f"meta/episodes/{key}")
         table = table.set_column(place, f"meta/episodes/{key}", pa.array(np.full(len(table), value, np.int64)))
     with files.replacing(tables[0]) as path:
-        pq.write_table(table, path, **_CHECKED)
+        pq.write_table(table, as_local(path), **_CHECKED)
     for file in tables[1:]:
         file.unlink()
 

@@ -120,7 +120,8 @@ def write_source(
     kind, notes = _KINDS[chosen], dict.fromkeys(source.notes)  # a dict as an ordered set
     kept = _without_text(source, notes, kind) if "text" not in kind.keeps else source
     lost: dict[str, None] = {}
-    watched = replace(kept, takes=lambda: _takes_noting_losses(kept, kind, lost))
+    seen: dict[str, list[int]] = {}
+    watched = replace(kept, takes=lambda: _takes_noting_losses(kept, kind, lost, notes, seen))
     written = _call(kind.write, watched, path, progress=progress, **more)
     if "sensors" not in kind.keeps:
         bare = Sensor("", "image", ())
@@ -130,7 +131,8 @@ def write_source(
             if facts and sensor.kind in ("image", "depth"):
                 lost[f"{', '.join(calibration or facts)} of '{name}'"] = None
     notes |= dict.fromkeys(written)
-    return [*notes, *(f"{what} has no place in {kind.name} and was left out." for what in lost)]
+    absent = _absences(kept, seen, "; its rows there are marked as padding" if chosen == "lerobot" else "")
+    return [*notes, *absent, *(f"{what} has no place in {kind.name} and was left out." for what in lost)]
 
 
 def _without_text(source: Source, notes: dict[str, None], kind: _Kind) -> Source:
@@ -145,9 +147,29 @@ def _without_text(source: Source, notes: dict[str, None], kind: _Kind) -> Source
     return replace(source, sensors=sensors, takes=takes) if texts else source
 
 
-def _takes_noting_losses(source: Source, kind: _Kind, lost: dict[str, None]) -> Iterator[Take]:
-    """The takes; parts that the format cannot store are added to `lost` as they are read."""
-    for take in source.takes():
+_EXAMPLES = 5  # takes that a note names
+
+
+def _absences(source: Source, seen: dict[str, list[int]], then: str) -> Iterator[str]:
+    """A note on each sensor that some takes lack; seen: sensor -> the takes that have it, "" -> all."""
+    every = seen.get("", [])
+    for name in source.sensors:
+        lacking = sorted(set(every).difference(seen.get(name, ())))
+        if lacking:
+            some = ", ".join(map(str, lacking[:_EXAMPLES])) + ", …" * (len(lacking) > _EXAMPLES)
+            where = "any take" if len(lacking) == len(every) else f"{len(lacking)} of {len(every)} takes ({some})"
+            yield f"'{name}' has no readings in {where}{then}."
+
+
+def _takes_noting_losses(
+    source: Source, kind: _Kind, lost: dict[str, None], notes: dict[str, None], seen: dict[str, list[int]]
+) -> Iterator[Take]:
+    """The takes. Adds what the format cannot store to `lost`, what could not be read to `notes`, and who has what to `seen`."""
+    seen.clear()
+    for number, take in enumerate(source.takes()):
+        notes |= dict.fromkeys(take.notes)
+        for name in ("", *(name for name, readings in take.readings.items() if len(readings.time_s))):
+            seen.setdefault(name, []).append(number)
         language = take.facts.get("language")
         for part, present in (("task", take.task), ("language", language), ("start_ns", take.start_ns is not None)):
             if present and part not in kind.keeps:

@@ -9,7 +9,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from ..core.errors import TrainingError
-from ..core.files import replacing, write_text
+from ..core.files import remedy_of, replacing, write_text
 
 LOG = "log.jsonl"
 
@@ -32,7 +32,7 @@ def save_run(
             save_file(whole, staged, metadata={"facts": json.dumps(facts)})
     except (OSError, SafetensorError) as error:
         raise TrainingError(
-            f"{path.parent} cannot be written ({error}); free some space and run the same command again, or give another --out."
+            f"{path.parent} cannot be written ({error}); {remedy_of(error)} and run the same command again, or give another --out."
         ) from error
 
 
@@ -82,7 +82,7 @@ def write_log(folder: Path, line: Mapping[str, object]) -> None:
             file.write(json.dumps(line) + "\n")
     except OSError as error:
         raise TrainingError(
-            f"{folder / LOG} cannot be written ({error}); free some space and run the same command again, or give another --out."
+            f"{folder / LOG} cannot be written ({error}); {remedy_of(error)} and run the same command again, or give another --out."
         ) from error
 
 

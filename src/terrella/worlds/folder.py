@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from torch import nn
 
 from ..core.errors import CheckpointError
+from ..core.files import remedy_of
 from ..core.spec import Spec
 from ..space.estimator import Estimator, EstimatorConfig, half_weights, load_weights
 from ..space.keyframes import Keyframes
@@ -72,7 +73,7 @@ def save_world(
             memory = data_file(remembered, "memory").read_bytes()
         write_world(path, about, weights, memory)
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
+        raise CheckpointError(f"{path} cannot be written ({error}); {remedy_of(error)} and save it again.") from error
 
 
 def save_latent(world: LatentWorld, path: str | Path) -> None:
@@ -83,7 +84,7 @@ def save_latent(world: LatentWorld, path: str | Path) -> None:
         about = _described(LATENT, LATENT_VERSION, world.about, parts)
         write_world(path, about, network.state_dict(), {"starts": world.starts})
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path} cannot be written ({error}); free some space and save it again.") from error
+        raise CheckpointError(f"{path} cannot be written ({error}); {remedy_of(error)} and save it again.") from error
 
 
 def _described(kind: str, version: int, about: About, parts: Mapping[str, Any]) -> dict[str, Any]:

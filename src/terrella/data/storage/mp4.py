@@ -25,6 +25,7 @@ from av.video.stream import VideoStream
 
 from ...core import files
 from ...core.errors import DatasetError
+from ...core.video import media_address
 from ..source import Lazy
 
 _RUN = struct.Struct(">II")  # flags and frames of a fragment's run
@@ -175,7 +176,7 @@ class Mp4Writer:
 
     def _encode(self) -> None:
         height, width = self._size
-        with av.open(str(self.path), "w", format="mp4", options=_GROWING) as container:
+        with av.open(media_address(self.path), "w", format="mp4", options=_GROWING) as container:
             stream = container.add_stream("libx264", rate=self._rate, options=_CODEC)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.codec_context.time_base = 1 / self._rate
@@ -192,7 +193,7 @@ class Mp4Writer:
 def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
     """The container of a video and its first stream; raises one of BROKEN where it is not a video."""
     _check_boxes(path)
-    with av.open(str(path), "r") as container:
+    with av.open(media_address(path), "r") as container:
         yield container, container.streams.video[0]
 
 
@@ -206,9 +207,9 @@ def finish_video(path: Path, target: Path, frames: int | None = None, first: int
 
     Nothing is encoded again; the first packet gets time 0. DatasetError where no packet is whole.
     """
-    count, begin, options = 0, 0, FINISHED
+    count, begin, options, to = 0, 0, FINISHED, media_address(target)
     try:
-        with open_video(path) as (source, stream), av.open(str(target), "w", format="mp4", options=options) as copy:
+        with open_video(path) as (source, stream), av.open(to, "w", format="mp4", options=options) as copy:
             out = copy.add_stream_from_template(stream, opaque=True)
             for packet in islice(source.demux(stream), first, None):
                 if packet.size == 0 or packet.is_corrupt or packet.pts is None or count == frames:

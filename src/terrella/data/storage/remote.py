@@ -149,7 +149,7 @@ class Files:
                         self._fetch(name, size, path)
             except OSError as error:
                 raise DatasetError(
-                    f"{name} of {self.root} cannot be kept in {self._cache} ({error}); free some space there."
+                    f"{name} of {self.root} cannot be kept in {self._cache} ({error}); {files.remedy_of(error)}."
                 ) from error
         return path
 

@@ -63,9 +63,14 @@ def read_rows(
         raise damaged_table(path, error) from error
 
 
+def as_local(path: Path) -> str:
+    """A path that pyarrow takes for no address, as it would "file:name" or "s3:name"."""
+    return os.path.abspath(path)
+
+
 def open_parquet(path: Path) -> pq.ParquetFile:
     """Opens a file with page checksums verified; ValueError where it claims absurdly many rows."""
-    file = pq.ParquetFile(path, page_checksum_verification=True)
+    file = pq.ParquetFile(as_local(path), page_checksum_verification=True)
     if not 0 <= file.metadata.num_rows <= max(_FEW_ROWS, _ROWS_A_BYTE * os.stat(path).st_size):
         raise ValueError(f"it claims {file.metadata.num_rows:,} rows in {os.stat(path).st_size:,} bytes")
     return file

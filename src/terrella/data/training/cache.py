@@ -122,7 +122,7 @@ class ClipCache:
                 try:
                     _build(dataset, size, cameras, path, budget_bytes, progress)
                 except OSError as error:
-                    raise DatasetError(f"cannot build the cache {path} ({error}); free some space there.") from error
+                    raise DatasetError(f"cannot build the cache {path} ({error}); {files.remedy_of(error)}.") from error
                 finally:
                     shutil.rmtree(shelf / ".building", ignore_errors=True)
         return ClipCache(path)

@@ -74,8 +74,7 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRo
     left_out, notes = [], dict[str, None]()  # each note once, in order
     with Recorder(root, layout, interrupted="discard") as recorder:
         for number, take in enumerate(source.takes()):
-            clock = take.readings.get(lead, _NONE).time_s
-            at = clock if how.fps is None else row_times(take, layout.sensors, how.fps)
+            at = _row_times(source, take, layout, lead, how)
             if len(at) < 2:
                 left_out.append(f"take {number} was left out: it has {len(at)} row{'s' * (len(at) != 1)}")
                 continue
@@ -89,6 +88,17 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRo
         if not recorder.episodes:
             raise DatasetError(f"nothing of {source.name} can be kept; {'; '.join(left_out)}.")
     return [*left_out, *notes]
+
+
+def _row_times(source: Source, take: Take, layout: Layout, lead: str, how: LeRobotRows) -> np.ndarray:
+    """The times of a take's rows: of the readings of `lead`, or of another sensor where the take lacks it."""
+    if how.fps is not None:
+        return row_times(take, layout.sensors, how.fps)
+    if len(clock := take.readings.get(lead, _NONE).time_s):
+        return clock
+    if source.fps is None:  # each sensor has its own clock
+        return row_times(take, layout.sensors, layout.fps)
+    return max((readings.time_s for readings in take.readings.values()), key=len, default=_NONE.time_s)
 
 
 def _lead(source: Source, first: Take) -> str:

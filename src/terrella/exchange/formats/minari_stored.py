@@ -10,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ...core.errors import DatasetError
+from ...data.storage.tables import as_local
 from . import rows
 from .arrays import Array, Place, Shapes, jpeg_rows, spelled
 
@@ -117,7 +118,7 @@ def _arrow(path: Path) -> pa.Table:
 
 
 def _parquet(path: Path) -> pa.Table:
-    with pq.ParquetFile(path) as file:
+    with pq.ParquetFile(as_local(path)) as file:
         if file.metadata.num_rows * sum(_width(field.type) for field in file.schema_arrow) > rows.MAX_BYTES:
             raise DatasetError(f"{path} claims {file.metadata.num_rows} rows; restore it from a copy.")
         return file.read()

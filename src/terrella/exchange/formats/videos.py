@@ -14,6 +14,7 @@ from av.video.stream import VideoStream
 
 from ...core.errors import DatasetError
 from ...core.files import creating
+from ...core.video import film_of, media_address, square_width
 from ...data.source import Lazy, Readings, Sensor, Source, Take
 from . import folders, rows
 from .folders import VIDEOS
@@ -31,8 +32,9 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     of their names. Every container that PyAV reads is accepted; other files are ignored.
 
     time_s are the file's presentation times, from the take's first frame on; they may be uneven. A phone's rotation is
-    applied. Frames are decoded when read, without seeking if in order. DatasetError where there are no videos, or one is
-    damaged, too large, or of another size than its camera's first.
+    applied, and pixels that are not square are made so by another width. Of several films in a file the longest is read; a
+    take's notes name the others, and sound. Frames are decoded when read, without seeking if in order. DatasetError where
+    there are no videos, or one is damaged, too large, or of another size than its camera's first.
     """
     path = Path(path)
     takes = folders.takes_of(path, VIDEOS, "videos", deep=False)
@@ -58,7 +60,8 @@ def _video_take(name: str, folder: Mapping[str, list[Path]], sensors: Mapping[st
             raise DatasetError(f"{video.path} is {size} where the first of its camera is {want}; keep them apart.")
     begin = min(video.time_s[0] for video in videos.values())
     readings = {n: Readings(v.time_s - begin, Lazy(len(v.time_s), v.frame)) for n, v in videos.items()}
-    return Take(readings, facts={"file": name})
+    left_out = dict.fromkeys(note for video in videos.values() for note in video.left_out)
+    return Take(readings, facts={"file": name}, notes=tuple(left_out))
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,7 @@ class _Video:
     rate_hz: float | None
     time_s: np.ndarray
     frames: FrameReader
+    left_out: tuple[str, ...]  # notes on further streams of the file
 
     def frame(self, i: int) -> np.ndarray:
         picture = self.frames(i)
@@ -81,8 +85,13 @@ class _Video:
 
 
 def _video(path: Path) -> _Video:
-    with _opened(path) as (container, stream):
-        rows.check_size(stream.height, stream.width, f"the video {path}")
+    with _opened(path) as container:
+        film = film_of(container)
+    with _opened(path) as container:
+        stream = container.streams.video[film]
+        left_out = _further_streams(container, stream)
+        coded, width = stream.width, square_width(stream, stream.width)
+        rows.check_size(stream.height, width, f"the video {path}")
         tick = stream.time_base or Fraction(1, 1000)
         rate_hz = float(stream.average_rate) if stream.average_rate else None
         shown = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
@@ -92,7 +101,7 @@ def _video(path: Path) -> _Video:
     keys = sorted({0, *(place[pts] for pts, is_key in shown if is_key)}) if timed else [0]
 
     def begin(key: int) -> Iterator[tuple[int, av.VideoFrame]]:
-        for i, frame in enumerate(_decoded(path, ticks[key] if key else None)):
+        for i, frame in enumerate(_decoded(path, film, ticks[key] if key else None)):
             number = place.get(frame.pts, -1) if timed else i
             if number >= 0:
                 yield number, frame
@@ -100,37 +109,54 @@ def _video(path: Path) -> _Video:
     def show(frame: av.VideoFrame) -> np.ndarray:
         rows.check_size(frame.height, frame.width, f"the video {path}")
         turns = round(frame.rotation / 90) % 4
+        if width != coded == frame.width:
+            frame = frame.reformat(width=width, format="rgb24", interpolation="BICUBIC")
         picture = frame.to_ndarray(format="rgb24")
         return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
 
-    first = next(_decoded(path, None), None)
+    first = next(_decoded(path, film, None), None)
     if first is None:
         raise DatasetError(f"the video {path} has no frames; remove it, or restore it from a copy.")
     times = [float(pts * tick) for pts in ticks]
     if not timed:
-        times = [frame.time for frame in _decoded(path, None)]
+        times = [frame.time for frame in _decoded(path, film, None)]
         if None in times or any(a >= b for a, b in zip(times, times[1:])):
             times = [i / (rate_hz or rows.FPS_UNKNOWN) for i in range(len(times))]
     frames = FrameReader(begin, lambda i: keys[bisect.bisect_right(keys, i) - 1], show, f"the video {path}")
-    return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), frames)
+    return _Video(path, show(first).shape, rate_hz, np.array(times, np.float64), frames, left_out)
 
 
-def _decoded(path: Path, seek_to: int | None) -> Iterator[av.VideoFrame]:
-    with _opened(path) as (container, stream):
+def _further_streams(container: InputContainer, film: VideoStream) -> tuple[str, ...]:
+    """Notes on everything in a file but its film."""
+    notes = []
+    for stream in container.streams:
+        if stream.type == "audio":
+            notes.append("the sound of videos was left out.")
+        elif isinstance(stream, VideoStream) and stream.index != film.index:
+            size = f"{stream.width} x {stream.height}" if stream.codec_context else "unknown size"
+            notes.append(f"a further stream of pictures ({size}) in videos was left out: the longest film is read.")
+        elif not isinstance(stream, VideoStream):
+            notes.append(f"a stream of {stream.type or 'unknown kind'} in videos was left out.")
+    return tuple(notes)
+
+
+def _decoded(path: Path, film: int, seek_to: int | None) -> Iterator[av.VideoFrame]:
+    with _opened(path) as container:
+        stream = container.streams.video[film]
         if seek_to is not None:
             container.seek(seek_to, stream=stream)
         yield from container.decode(stream)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """A video and its first picture stream; FFmpeg's errors become a DatasetError. FFmpeg gets an open file and may open no other,
+def _opened(path: Path) -> Iterator[InputContainer]:
+    """A video; FFmpeg's errors become a DatasetError. FFmpeg gets an open file and may open no other,
     so that a playlist cannot lead it out of the folder."""
     try:
         with open(path, "rb") as file, av.open(file, "r", options={"protocol_whitelist": "none"}) as container:
-            if not container.streams.video or container.streams.video[0].codec_context is None:
+            if not any(stream.codec_context for stream in container.streams.video):
                 raise DatasetError(f"{path} has no pictures that can be decoded; remove it from the folder of videos.")
-            yield container, container.streams.video[0]
+            yield container
     except (av.FFmpegError, OSError, ValueError, MemoryError) as error:
         raise DatasetError(f"the video {path} is missing, damaged or unknown ({error}); restore it.") from error
 
@@ -166,7 +192,7 @@ def _encode(path: Path, sensor: Sensor, readings: Readings, begin: float, where:
     if (np.diff(ticks) <= 0).any():
         raise DatasetError(f"'{sensor.name}' in {where} has two pictures within a microsecond; drop one of them.")
     height, width, _ = sensor.shape
-    with av.open(str(path), "w", format="mp4") as container:
+    with av.open(media_address(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", options=_CODEC)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.time_base = stream.codec_context.time_base = _CLOCK

@@ -7,6 +7,7 @@ import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ...core.errors import DatasetError
+from ...core.video import film_of, media_address, square_width
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
@@ -76,15 +77,19 @@ def video_pictures(path: Path, count: int, longest: int) -> list[np.ndarray]:
     from av.error import FFmpegError
 
     try:
-        with av.open(str(path)) as file:
-            stream = file.streams.video[0]
+        with av.open(media_address(path)) as file:
+            film = film_of(file)
+        with av.open(media_address(path)) as file:
+            stream = file.streams.video[film]
             total = stream.frames or sum(packet.size > 0 for packet in file.demux(stream))
         best: dict[int, tuple[float, np.ndarray]] = {}
-        with av.open(str(path)) as file:
-            for number, frame in enumerate(file.decode(file.streams.video[0])):
-                share = min(1.0, longest / max(frame.width, frame.height))
+        with av.open(media_address(path)) as file:
+            stream = file.streams.video[film]
+            for number, frame in enumerate(file.decode(stream)):
+                width = square_width(stream, frame.width)
+                share = min(1.0, longest / max(width, frame.height))
                 picture = frame.reformat(
-                    round(frame.width * share), round(frame.height * share), "rgb24", interpolation="AREA"
+                    round(width * share), round(frame.height * share), "rgb24", interpolation="AREA"
                 ).to_ndarray()
                 picture, clear = np.rot90(picture, round(frame.rotation / 90)), sharpness(picture)
                 stretch = number * count // max(total, count)
