@@ -1,6 +1,5 @@
 """What a Gymnasium environment declares about itself: names and keys of its actions, its frame rate."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, EnumMeta
@@ -11,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.keys import default_keys, parse_keys
+from ..core.step_length import step_length
 
 _NAMERS = ("get_action_meanings", "action_meanings", "get_action_names", "action_names", "get_combos")
 DEFAULT_FPS = 10  # of an environment without a frame rate
@@ -27,17 +27,17 @@ class EnvironmentFacts:
 
 
 def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
-    """Reads the facts from the environment. Action names: `names`, `get_action_meanings` and the like, an `Actions` enum, or any
-    attribute with "action" in its name that names each action. Keys: `get_keys_to_action`. Time: `dt`, `tau` or
-    metadata["render_fps"]."""
+    """Reads the facts from an environment that has been reset, and may step it. Action names: `names`, `get_action_meanings` and
+    the like, an `Actions` enum, or any attribute with "action" in its name that names each action. Keys: `get_keys_to_action`.
+    Time: see `step_length`."""
     space, bare = env.action_space, env.unwrapped
     labels, source = (tuple(names), "its adapter") if names else _names(bare, space)
-    dt_s, clock = _step_seconds(env)
-    how = {"action names": source or "none", "frame rate": clock}
+    dt_s, clock = step_length(env)
+    how = {"action names": source or "none", "frame rate": clock if dt_s else f"{clock}, so {DEFAULT_FPS}"}
     table = _called(getattr(bare, "get_keys_to_action", None)) or getattr(bare, "keys_to_action", None)
     keys = parse_keys(table, space) if isinstance(table, Mapping) else {}
     how["keys"] = "get_keys_to_action" if keys else "by the actions' names" if labels else "default"
-    return EnvironmentFacts(labels, keys or default_keys(space, labels), dt_s, how)
+    return EnvironmentFacts(labels, keys or default_keys(space, labels), dt_s or 1 / DEFAULT_FPS, how)
 
 
 def _names(bare: gymnasium.Env, space: spaces.Space) -> tuple[tuple[str, ...], str]:
@@ -82,13 +82,3 @@ def _called(function: Callable | None) -> Any:
         return function() if callable(function) else None
     except Exception:  # foreign code, whose result is optional
         return None
-
-
-def _step_seconds(env: gymnasium.Env) -> tuple[float, str]:
-    """(seconds per step, where they come from)."""
-    for name in ("dt", "tau"):
-        seconds = getattr(env.unwrapped, name, None)
-        if isinstance(seconds, float) and 0 < seconds < math.inf:
-            return seconds, f"its {name}"
-    fps = env.metadata.get("render_fps")
-    return (1 / fps, "its render_fps") if fps else (1 / DEFAULT_FPS, f"none, so {DEFAULT_FPS}")

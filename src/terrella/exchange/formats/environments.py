@@ -7,6 +7,8 @@ import gymnasium
 import numpy as np
 
 from ...core.errors import DatasetError
+from ...core.numbers import single_number
+from ...core.step_length import step_length
 from ...data.source import Sensor, Source, Take
 from . import arrays, rows, spaces
 from .arrays import Array, Place
@@ -20,7 +22,7 @@ def from_env(
 ) -> Source:
     """Rollouts of an environment, given by its id or a function that makes one; the same at each call of `takes`.
 
-    fps: rows per second. Default: from the environment's dt or tau, else its render_fps, else rows.FPS_UNKNOWN.
+    fps: rows per second. Default: from what the environment says of its steps (core/step_length.py), else rows.FPS_UNKNOWN.
 
     An episode is truncated after 1000 steps. There is one more observation than actions: the last one is kept. Spaces are
     flattened as in minari.read. DatasetError for unknown ids, and spaces that are not arrays.
@@ -30,7 +32,9 @@ def from_env(
     rows.check_fps(fps, "the rollout")
     made, name = _make(env)
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
-    stated = {"fps": _rate(made)}
+    made.reset(seed=seed)
+    seconds, clock = step_length(made)
+    stated = {"fps": seconds and 1 / seconds}
     made.close()
     leaves = {
         (root, *place): leaf
@@ -40,7 +44,9 @@ def from_env(
     known = {place: leaf for place, leaf in leaves.items() if leaf} | dict.fromkeys(
         _FOLLOW, Array((0,), np.dtype(float))
     )
-    sensors, _ = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
+    sensors, notes = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
+    if ";" in clock and fps is None:
+        notes.append(f"{name} has {stated['fps']:g} steps a second by {clock}; give fps to correct that.")
 
     def takes(rate: float) -> Iterator[Take]:
         made, _ = _make(env)
@@ -52,7 +58,7 @@ def from_env(
             made.close()
 
     facts = {"observation_space": observation, "action_space": action, "env": name, "seed": seed}
-    return arrays.source(name, name, sensors, takes, fps=fps, about=stated, facts=facts)
+    return arrays.source(name, name, sensors, takes, fps=fps, about=stated, notes=notes, facts=facts)
 
 
 def _make(env: str | Callable[[], gymnasium.Env]) -> tuple[gymnasium.Env, str]:
@@ -65,16 +71,6 @@ def _make(env: str | Callable[[], gymnasium.Env]) -> tuple[gymnasium.Env, str]:
     return made, env if isinstance(env, str) else type(made.unwrapped).__name__
 
 
-def _rate(env: gymnasium.Env) -> float | None:
-    """Steps per second, as the environment declares it."""
-    for name in ("dt", "tau"):
-        dt_s = getattr(env.unwrapped, name, None)
-        if isinstance(dt_s, int | float) and dt_s > 0:
-            return 1 / dt_s
-    stated = env.metadata.get("render_fps")
-    return float(stated) if isinstance(stated, int | float) and stated > 0 else None
-
-
 def _rollout(env: gymnasium.Env, draw: np.ndarray) -> dict[str, list]:
     seen, _ = env.reset(seed=int(draw[0]))
     env.action_space.seed(int(draw[1]))
@@ -84,9 +80,9 @@ def _rollout(env: gymnasium.Env, draw: np.ndarray) -> dict[str, list]:
     while not (done or cut):
         action = env.action_space.sample()
         seen, reward, terminated, truncated, _ = env.step(action)
-        done, steps = bool(terminated), len(episode["actions"]) + 1
-        cut = bool(truncated) or (steps == _MAX_STEPS and not done)
-        for name, value in zip(arrays.GYMNASIUM, (seen, action, float(reward), done, cut)):
+        done, steps = bool(single_number(terminated, "its termination")), len(episode["actions"]) + 1
+        cut = bool(single_number(truncated, "its truncation")) or (steps == _MAX_STEPS and not done)
+        for name, value in zip(arrays.GYMNASIUM, (seen, action, single_number(reward, "its reward"), done, cut)):
             episode[name].append(value)
     return episode
 

@@ -1,0 +1,160 @@
+"""Seconds that one step of a Gymnasium environment lasts: from its own clock, control rate, time step or frame rate."""
+
+import math
+from collections.abc import Iterator
+from operator import attrgetter
+from typing import Any
+
+import gymnasium
+
+from .errors import TerrellaError
+from .numbers import single_number
+from .spec import Spec, neutral_action
+
+# Simulated time in seconds, in attributes of the bare environment.
+_SIMULATORS = ("data.time", "sim.data.time", "physics.data.time", "_env.physics.data.time")
+_CLOCKS = ("time", "sim_time", "simulation_time", "_time")
+# By name the rate, or the length, of a step of the environment.
+_RATES = (
+    "control_freq",
+    "control_frequency",
+    "control_hz",
+    "control_rate",
+    "ctrl_freq",
+    "policy_freq",
+    "policy_frequency",
+)
+_PERIODS = ("control_timestep", "control_dt", "ctrl_timestep", "ctrl_dt", "step_dt")
+# The length of a step of the environment or of its physics; of its physics alone; and how many of these a step has.
+_STEPS = ("dt", "tau", "timestep", "time_step")
+_PHYSICS = ("physics_dt", "sim_dt", "sim_timestep", "physics_timestep", "model.opt.timestep", "sim.model.opt.timestep")
+_COUNTS = (
+    "frame_skip",
+    "frameskip",
+    "n_substeps",
+    "num_substeps",
+    "substeps",
+    "sim_steps",
+    "decimation",
+    "action_repeat",
+)
+_FRAMES = ("render_fps", "video.frames_per_second")
+_TRIAL_STEPS, _LONGEST_S = 3, 60.0
+
+
+def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
+    """(seconds that one step of `env` lasts, where they come from and what else the environment says); (None, ...) where it
+    says nothing.
+
+    `env` has been reset; one with a clock is stepped up to three times. In this order: the advance of its simulated time
+    (MuJoCo's `data.time`, or a `time` that all steps advance alike); a control rate; a time step, times its substeps where it
+    counts them. A time step of which two or more whole ones make a frame of `render_fps` is a substep, and the frame is the
+    step. Without any of these, the frame.
+    """
+    frame, remark = _frame(env)
+    stated = {**_control(env), **_stepped(env, frame), **frame}
+    measured = _measured(env)
+    if not measured and not stated:
+        return None, "; ".join(["none", *remark])
+    chosen, seconds = next(iter((measured or stated).items()))
+    others = {name: other for name, other in stated.items() if not math.isclose(other, seconds, rel_tol=0.02)}
+    differing = [f"by its {name} it would be {1 / other:g}" for name, other in others.items()]
+    return seconds, "; ".join([f"its {chosen}", *differing, *remark])
+
+
+def _measured(env: gymnasium.Env) -> dict[str, float]:
+    """{clock: seconds that each step advances it}; {} where no clock is one."""
+    clocks = {name: now for name in (*_SIMULATORS, *_CLOCKS) if isinstance(now := _at(env, name), float)}
+    if not clocks:
+        return {}
+    times = {name: [now] for name, now in clocks.items()}
+    try:
+        action = neutral_action(Spec("trial", env.action_space, {}, (), 1.0))[()]
+        for _ in range(_TRIAL_STEPS):
+            _, _, terminated, truncated, _ = env.step(action)
+            for name, seen in times.items():
+                seen.append(float(_at(env, name)))
+            if terminated or truncated:
+                break
+    except Exception:  # foreign code: its own errors are reported where it is stepped in earnest
+        return {}
+    for name, seen in times.items():
+        steps = [after - before for before, after in zip(seen, seen[1:])]
+        alike = all(math.isclose(step, steps[0], rel_tol=1e-3) for step in steps)
+        if steps and alike and 1e-5 < steps[0] < _LONGEST_S and (len(steps) > 1 or name in _SIMULATORS):
+            return {f"clock `{name}`": float(f"{steps[0]:.6g}")}
+    return {}
+
+
+def _control(env: gymnasium.Env) -> dict[str, float]:
+    rates = {name: 1 / rate for name, rate in _positive(env, _RATES)}
+    return dict(list({**rates, **dict(_positive(env, _PERIODS))}.items())[:1])
+
+
+def _stepped(env: gymnasium.Env, frame: dict[str, float]) -> dict[str, float]:
+    """{what declares the step: seconds, ...}, the step first, from time steps, their number, and the length of a frame."""
+    count_name, count = next(iter(_positive(env, _COUNTS)), ("", 1.0))
+    steps, physics = dict(_positive(env, _STEPS)), dict(_positive(env, _PHYSICS))
+    frame_s = next(iter(frame.values()), None)
+    lengths: dict[str, float] = {}
+    for name, length in {**steps, **physics}.items():
+        whole = f"{name} x {count_name}", length * count
+        computed = isinstance(
+            getattr(type(env.unwrapped), name, None), property
+        )  # as MujocoEnv.dt, which counts its substeps
+        if count == 1 or (name in steps and (computed or _nearer(length, length * count, frame_s))):
+            whole = name, length
+        lengths[whole[0]] = whole[1]
+    if count > 1 or frame_s is None or not lengths:
+        return lengths
+    name, length = next(iter(lengths.items()))
+    multiple = frame_s / length
+    if (name in physics and not math.isclose(multiple, 1, rel_tol=0.02)) or _whole(multiple):
+        return {**frame, f"{name}, a substep,": length}
+    return lengths
+
+
+def _nearer(one: float, other: float, frame_s: float | None) -> bool:
+    """Whether the first of two lengths is nearer to that of a frame, as a ratio."""
+    return frame_s is not None and abs(math.log(one / frame_s)) < abs(math.log(other / frame_s))
+
+
+def _whole(multiple: float) -> bool:
+    return multiple > 1.5 and math.isclose(multiple, round(multiple), rel_tol=0.01)
+
+
+def _frame(env: gymnasium.Env) -> tuple[dict[str, float], list[str]]:
+    """({frame rate: seconds of a frame}, [what cannot be read])."""
+    metadata = getattr(env, "metadata", None) or {}
+    for name in _FRAMES:
+        if (stated := metadata.get(name)) is not None:
+            rate = _number(stated)
+            return ({name: 1 / rate}, []) if rate else ({}, [f"its {name}, {stated!r}, is no rate"])
+    return {}, []
+
+
+def _positive(env: gymnasium.Env, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+    """(name, number) of the attributes that are positive numbers, in small or capital letters."""
+    for name in names:
+        for spelled in (name, name.upper()):
+            if number := _number(_at(env, spelled)):
+                yield spelled, number
+                break
+
+
+def _at(env: gymnasium.Env, path: str) -> Any:
+    """The value at a path of attributes; the result, where it is a method; None where there is none."""
+    try:
+        value = attrgetter(path)(env.unwrapped)
+        return value() if callable(value) else value
+    except Exception:  # foreign code, whose answer is optional
+        return None
+
+
+def _number(value: Any) -> float | None:
+    """A positive finite number, or text that spells one; else None."""
+    try:
+        number = float(value) if isinstance(value, str) else single_number(value, "")
+    except (TerrellaError, ValueError):
+        return None
+    return number if not isinstance(value, bool) and 0 < number < math.inf else None
