@@ -29,7 +29,8 @@ class Moment:
     states: tuple[State, ...] | None = None
     rngs: tuple[torch.Tensor, ...] | None = None  # states of the random generators after this step
     uncertainty: float = -1.0  # expected error of the last image; -1 if its world has no such channel
-    vitals: tuple[float, ...] = ()  # of the player of the first world
+    vitals: tuple[float, ...] = ()  # numbers of the first world, such as the player's health
+    age: int = 0  # steps since its episode began
 
 
 class History:

@@ -200,6 +200,7 @@ def encode_event(kind: str, **body) -> str:
              goal, in unit, or null; considers: whether it has futures to show.
     acted:   the agent's last action, as held keys and, for axes, as numbers; both empty if the person acted.
     goal:    at: a place on the map; image: a JPEG in base64; words. Each is null unless it is the goal.
+    ended:   how the episode ended that the last frame was of: outcome ("died", "won", "lost" or "over"), text, steps.
     futures: step at which they were requested, and plans, from the chosen one down to the worst: cost (null if not finite), and
              image, a JPEG in base64 of `frames` frames side by side, from the decision to the plan's end.
     chart:   world (its number on the page) and step, then camera [x, y in metres, heading in radians], known (the share of its

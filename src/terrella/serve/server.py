@@ -28,9 +28,10 @@ from .guard import RateLimit
 from .http_server import application, serve_page
 from .keys import Keep, KeyBook
 from .picture import uncertainty_levels
+from .presentation import aims, drawn_by, events_of, numbers_of
 from .recording import SinkFactory
 from .session import Session
-from .timeline import Timeline, check_playable, no_rewind, vitals
+from .timeline import Timeline, check_playable, no_rewind
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class ServeConfig:
     faults: int = 20  # malformed messages after which its socket is closed
     history_s: float = 30.0  # seconds of pictures that are kept, for rewinding and clips
     state_mb: int = 256  # memory for the states among them, in MiB
+    command: str = ""  # what starts this server again, for pages that have lost it
+    home: bool = False  # whether there is a start page, to which the page links
 
 
 class Sessions:
@@ -127,6 +130,8 @@ class Sessions:
                 for world, label in zip(self.worlds, labels, strict=True)
             ],
             no_rewind=no_rewind(self.worlds),
+            command=self.config.command,
+            home=self.config.home,
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             agent=self._agents is not None,
             goals={
@@ -151,7 +156,10 @@ def _describe(world: World, label: str) -> dict:
         "action_frame": spec.action_frame,
         "axes": axes_of(spec),
         "scored": "reward" in spec.channels,
-        "vitals": vitals(spec),
+        "vitals": numbers_of(spec),
+        "events": events_of(spec),
+        "aims": aims(spec),
+        "drawn": drawn_by(spec),
         "uncertainty": uncertainty_levels(spec),
         "mapped": map_kind(spec),
         "knows_share": has_known_share(spec),

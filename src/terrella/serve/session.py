@@ -25,6 +25,7 @@ from .timeline import Timeline
 MAX_UNACKED = 2
 FUTURES_SHARE = 0.4  # of the worker's time, at most, for the futures that an agent considers
 FUTURES_EVERY_S = 0.5  # at least, between two of them
+ENDING_S = 2.0  # for which the last picture of an episode stays, before the next begins
 
 
 class Session:
@@ -176,6 +177,9 @@ class Session:
         except Exception as error:
             return self._fail(error)
         await self._send(moment, timeline, made_ms, controls)
+        if timeline.ending is not None:
+            self._due = time.perf_counter() + ENDING_S
+            await self._event("ended", **timeline.ending)
 
     def _step(self, timeline: Timeline) -> tuple[HeldControls, Moment, float]:
         """In the worker, so that the controls are read as late as possible."""
@@ -221,7 +225,7 @@ class Session:
                     timeline.look(value.cameras)
                     self._unseen = self._unseen or timeline.shown
             if kind in ("resume", "restart", "branch", "picture"):
-                self._paused, self._error = False, ""
+                self._paused, self._error, self._due = False, "", 0.0
         except TerrellaError as error:
             await self._event("error", text=str(error))
         except Exception as error:

@@ -18,16 +18,11 @@ from .chart import map_event, map_kind, tint_invented
 from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
+from .presentation import events_of, numbers_of, outcome
 from .protocol import DONE, FRESH, Goal
 from .recording import SessionRecording, SinkFactory
 
 JPEG_QUALITY = 90
-
-
-def vitals(spec: Spec) -> list[str]:
-    """The channels that are single numbers, such as health, which the page shows beside the score."""
-    others = ("reward", "done", "uncertainty")
-    return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
 
 
 def _alike(one: Spec, other: Spec, name: str) -> bool:
@@ -83,6 +78,7 @@ class Timeline:
         self.obeyed = self.spec if keys is None else keys  # the spec whose keys a person presses
         self.no_rewind = no_rewind(worlds)
         self.notice = ""  # a message for the person, in one sentence
+        self.ending: dict[str, object] | None = None  # of an episode that is over: outcome, text, steps
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
         self.driver = Driver(agents_of(policy), worlds[0])
         self.recording = SessionRecording(sink_factory)
@@ -318,6 +314,11 @@ class Timeline:
         acted = action is not None
         reward = float(seen["reward"][0]) if "reward" in seen and acted else 0.0
         done = bool(seen["done"][0]) if "done" in seen and acted else False
+        age = 0 if flags & FRESH else self.shown.age + 1
+        numbers = self._numbers(seen, acted, bool(flags & FRESH))
+        self.ending = (
+            dict(outcome(numbers_of(self.spec), numbers, reward, self._return, age), steps=age) if done else None
+        )
         self._return += reward
         self.recording.add(seen, action, reward, done)
         self.notice = self.recording.fault or self.notice
@@ -329,18 +330,26 @@ class Timeline:
             None if self.no_rewind else self._states,
             None if self.no_rewind else tuple(rng.get_state() for rng in self._rngs),
             float(last["uncertainty"][0]) if "uncertainty" in last else -1.0,
-            tuple(float(seen[name][0]) for name in vitals(self.spec)),
+            numbers,
+            age,
         )
         self.history.push(moment)
         self.shown = moment
         return moment
+
+    def _numbers(self, seen: Mapping[str, torch.Tensor], acted: bool, begins: bool) -> tuple[float, ...]:
+        """The numbers of a step; of events, how many of them there were in this episode."""
+        names, events = numbers_of(self.spec), events_of(self.spec)
+        earlier = dict.fromkeys(names, 0.0) if begins else dict(zip(names, self.shown.vitals, strict=True))
+        now = {name: float(seen[name][0]) for name in names}
+        return tuple(earlier[name] + now[name] * acted if name in events else now[name] for name in names)
 
     def _observed(self, number: int) -> Mapping[str, torch.Tensor]:
         """The channels of a world that are shown, and those that are recorded."""
         spec = self.worlds[number].spec
         wanted = [*self._shown_of(number).values(), "uncertainty"]
         if number == 0:
-            wanted += ["reward", "done", *vitals(spec), *(spec.recorded if self.recording.on else ())]
+            wanted += ["reward", "done", *numbers_of(spec), *(spec.recorded if self.recording.on else ())]
         names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))
         return self.worlds[number].render(self._states[number], names)
 

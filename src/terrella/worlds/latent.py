@@ -59,7 +59,11 @@ class LatentWorld:
         shows |= {"reward": REWARD, "done": DONE, "done_probability": unit, "uncertainty": unit}
         poses = {name: POSE_UNIT for name in shows if kind_of(name) == "pose"}
         needed = ("rgb",) if config.pictured else config.seen
-        card = {**about.card, **({"ignored channels": ", ".join(about.ignored)} if about.ignored else {})}
+        card = {
+            "kind": "latent",
+            **about.card,
+            **({"ignored channels": ", ".join(about.ignored)} if about.ignored else {}),
+        }
         return Spec(
             name=about.name,
             action=about.controls.space(),

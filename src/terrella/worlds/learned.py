@@ -157,7 +157,7 @@ class LearnedWorld:
             scene.channels(), self.body.channels(), self.objects.channels(self.size), self.outcome.channels(),
             self.uncertainty.channels(),
         ]  # fmt: skip
-        card = dict(about.card)
+        card: dict[str, object] = {"kind": "learned", **about.card}
         if about.ignored:
             card["ignored channels"] = ", ".join(about.ignored)
         return Spec(

@@ -5,7 +5,7 @@ import { Controls } from './controls.js';
 import { DriverView } from './driver.js';
 import { Futures } from './futures.js';
 import { Goal } from './goal.js';
-import { drawKeycaps, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
+import { drawKeycaps, hintsOf, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { Past, write } from './past.js';
@@ -19,7 +19,7 @@ const app = $('app'), KEPT = 8192;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
-let worlds = [], light = () => {}, status = {}, noRecord = '', state = 'connecting';
+let worlds = [], light = () => {}, status = {}, noRecord = '', command = '', state = 'connecting';
 let pending = null, controlsId = 0, autoPaused = false, recordSince = 0;
 
 // -- the connection -------------------------------------------------------------------------------------------------
@@ -73,12 +73,14 @@ function onEvent(body) {
   if (body.type === 'goal') goal.show(body);
   if (body.type === 'futures') futures.show(body);
   if (body.type === 'acted') driver.acted(body);
+  if (body.type === 'ended') showEnding(body);
   if (body.type === 'error') toast(body.text);
 }
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
-  ({ worlds, no_record: noRecord } = body);
+  ({ worlds, no_record: noRecord, command } = body);
+  if (body.home) $('brand').href = `/start?${link.params()}`;
   driver.take(body);
   past.take(worlds[0], body.no_rewind);
   if (panel.take(worlds[0])) sendKeys();
@@ -129,6 +131,8 @@ function paint(time) {
   const fresh = frame.flags & FRESH && frame.step > 0 && live;
   past.pass(frame, fresh);
   if (fresh) screens.flash();
+  if (fresh || !live) app.classList.remove('ended');
+  if (live && !fresh && worlds[0].events.some((name) => frame.vitals[worlds[0].vitals.indexOf(name)] > now.vitals[worlds[0].vitals.indexOf(name)])) screens.strike();
   Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
   uncertainty.show(frame.uncertainty, !!(frame.flags & FRESH) || !live);
@@ -149,7 +153,9 @@ function keep(list, value) {
 function build() {
   $('name').textContent = worlds.map((world) => world.name).join('  ·  ');
   document.title = `${worlds[0].name} · Terrella`;
-  $('what').textContent = worlds[worlds.length - 1].card.what ?? '';
+  const { drawn, card: facts } = worlds[worlds.length - 1];
+  $('what').textContent = drawn ? `${worlds.length > 1 ? 'The dream: a' : drawn[0]}${drawn.slice(1)}` : facts.what ?? '';
+  $('what').classList.toggle('drawn', !!drawn);
   screens.setWorlds(worlds);
   views.drawCameras();
   drawKeys();
@@ -158,7 +164,7 @@ function build() {
   document.querySelectorAll('.vital').forEach((cell) => cell.remove());
   for (const name of worlds[0].vitals) {
     const cell = Object.assign(document.createElement('div'), { className: 'vital' });
-    cell.append(Object.assign(document.createElement('dt'), { textContent: name }));
+    cell.append(Object.assign(document.createElement('dt'), { textContent: label(name) }));
     cell.append(Object.assign(document.createElement('dd'), { id: `vital-${name}`, textContent: '–' }));
     $('score-cell').after(cell);
   }
@@ -183,17 +189,34 @@ function able(button, why, title) {
   button.title = why ? `${title}: not available, ${why}` : title;
 }
 
+/** How a number is called: events are counted. */
+function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) ? 's' : ''); }
+
+/** The last picture of an episode, with how it ended, until the next begins. */
+function showEnding({ outcome, text, steps }) {
+  const seconds = steps * worlds[0].dt_s, numbers = worlds[0].vitals.map((name, at) => [name, now.vitals[at]]).filter(([name, value]) => value && name !== 'health');
+  $('ending-text').textContent = text;
+  $('ending-more').textContent = [...numbers.map(([name, value]) => `${+value.toFixed(1)} ${label(name)}`), worlds[0].scored && `score ${+now.score.toFixed(1)}`, `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`].filter(Boolean).join(' · ');
+  app.dataset.outcome = outcome;
+  app.classList.add('ended');
+}
+
 function hint() {
-  const caps = Object.keys(worlds[0].keys).filter((code) => !/^Arrow(Up|Down)/.test(code) || !('KeyW' in worlds[0].keys)).slice(0, 6);
-  const parts = caps.flatMap((code) => [Object.assign(document.createElement('kbd'), { textContent: keyLabel(code) }), ' ']);
-  $('hint').replaceChildren(...(app.classList.contains('touchable') ? ['Put a thumb on a stick to move'] : caps.length ? ['Press ', ...parts, worlds[0].axes.length ? 'or move a slider' : 'to move'] : ['Move a slider, or click the picture and move the mouse']));
-  $('hint').classList.toggle('show', caps.length + worlds[0].axes.length > 0);
-  setTimeout(() => $('hint').classList.remove('show'), 9000);
+  const world = worlds[0], touch = app.classList.contains('touchable'), make = (tag, textContent) => Object.assign(document.createElement(tag), { textContent });
+  const keys = touch ? [] : hintsOf(world).map(([codes, word]) => {
+    const part = make('span', '');
+    part.append(...codes.map((code) => make('kbd', keyLabel(code))), make('em', word));
+    return part;
+  });
+  const axes = !world.axes.length ? [] : [make('span', touch || !screens.cameras.length ? 'Move a slider' : 'Move a slider, or click the picture and move the mouse')];
+  $('hint').replaceChildren(...(touch && !world.axes.length ? [make('span', ['Put a thumb on a stick', ...controls.plan.extra.slice(0, 2).map((code) => `press “${keyMeaning(world, code)}”`)].join(', '))] : [...keys, ...axes]));
+  $('hint').classList.toggle('show', $('hint').childElementCount > 0 && world.actions.length + world.axes.length > 0);
+  setTimeout(() => $('hint').classList.remove('show'), 20000);
 }
 
 const STATES = {
   connecting: ['Connecting', ''], starting: ['Starting the world', ''], playing: ['', ''], paused: ['', ''], rewound: ['', ''],
-  reconnecting: ['Reconnecting', 'The world is paused.'], elsewhere: ['Open in another page', '', 'Play here'],
+  reconnecting: ['Reconnecting', 'The world is paused.'], away: ['The server does not answer', 'Where it has stopped, this command starts it again. This page then goes on by itself.'], elsewhere: ['Open in another page', '', 'Play here'],
   refused: ['Not connected', '', 'Try again'], failed: ['The world stopped', '', 'Restart'],
 };
 
@@ -204,6 +227,8 @@ function showState(name, text = '') {
   const [title, more, button] = STATES[name];
   $('banner').classList.toggle('show', !!title);
   if (title) [$('banner-text').textContent, $('banner-more').textContent] = [title, text || more];
+  $('banner-command').hidden = name !== 'away' || !command;
+  $('banner-command').textContent = command;
   $('banner-button').hidden = !button;
   $('banner-button').textContent = button ?? '';
   past.dirty = true;
@@ -319,10 +344,12 @@ function fullscreen() {
 addEventListener('keydown', (event) => {
   if (event.target.tagName === 'INPUT' || event.ctrlKey || event.metaKey || event.altKey) return;
   const button = event.target.closest?.('button') && (event.code === 'Enter' || event.code === 'Space');
+  if (event.target === $('timeline') && past.key(event.code)) return event.preventDefault();
   if (controls.press(event.code, event.timeStamp)) event.preventDefault();
   else if (event.code === 'Backspace') { event.preventDefault(); if (!event.repeat) past.startRewind(); }
   else if (!event.repeat && !button && SHORTCUTS[event.code]) { event.preventDefault(); SHORTCUTS[event.code](); }
 });
+addEventListener('click', ({ target, detail }) => { if (detail) target.closest?.('button')?.blur(); });  // after a mouse, keys are the world's
 addEventListener('keyup', (event) => {
   controls.lift(event.code, event.timeStamp);
   if (event.code === 'Backspace') past.stopRewind();
@@ -339,6 +366,7 @@ $('full').onclick = fullscreen;
 $('smooth').onclick = () => $('smooth').setAttribute('aria-pressed', app.classList.toggle('smooth'));
 $('branch').onclick = () => link.send({ type: 'branch' });
 $('now').onclick = () => link.send({ type: 'resume' });
+$('banner-command').onclick = async () => { await navigator.clipboard.writeText(command); toast('Copied.'); };
 $('banner-button').onclick = () => (state === 'failed' ? restart(status.seed ?? 0) : link.connect());
 const card = { get open() { return !$('card').hidden; }, toggle(open) { $('card').hidden = !open; } };
 function showAside(which) {

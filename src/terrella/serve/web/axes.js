@@ -54,11 +54,12 @@ export class Axes {
 
   row(axis, at) {
     const make = (tag, text = '') => Object.assign(document.createElement(tag), { textContent: text });
+    const { factor, unit } = measure(axis);
     const label = make('label'), name = make('b', axis.name.replaceAll('_', ' ')), value = make('output'), ends = make('i');
     const slider = Object.assign(make('input'), { type: 'range', min: axis.low, max: axis.high, step: axis.whole ? 1 : 'any' });
-    ends.append(make('span', digits(axis.low)), make('span', digits(axis.high)));
+    ends.append(make('span', digits(factor * axis.low)), make('span', digits(factor * axis.high)));
     const stick = STICKS.find((one) => this.moves(one, at)), by = stick ? `; the ${STICK_NAMES[stick]} moves it` : '';
-    label.title = `${axis.name}: ${digits(axis.low)} to ${digits(axis.high)} ${axis.unit}${by}; double click for ${digits(axis.neutral)}`;
+    label.title = `${axis.name}: ${digits(factor * axis.low)} to ${digits(factor * axis.high)} ${unit}${by}; double click for ${digits(factor * axis.neutral)}`;
     slider.oninput = (event) => { this.lead(); this.set[at] = Number(slider.value); this.merge(event.timeStamp); };
     slider.onchange = () => slider.blur();  // the keys are the world's again
     label.ondblclick = (event) => { this.set[at] = axis.neutral; this.merge(event.timeStamp); };
@@ -149,7 +150,7 @@ export class Axes {
     this.held = held;
     this.rows.forEach(({ slider, value }, at) => {
       const pressed = held.map((code) => this.keys[code]?.[at] ?? 0).reduce((a, b) => (Math.abs(b) > Math.abs(a) ? b : a), 0);
-      const shown = this.led?.[at] ?? (pressed || this.values[at]), text = `${digits(shown)} ${this.axes[at].unit}`.trim();
+      const shown = this.led?.[at] ?? (pressed || this.values[at]), { factor, unit } = measure(this.axes[at]), text = `${digits(factor * shown)} ${unit}`.trim();
       if (document.activeElement !== slider || slider.value !== String(shown)) slider.value = shown;
       if (value.textContent !== text) value.textContent = text;
     });
@@ -176,6 +177,12 @@ export class Axes {
       requestAnimationFrame(tick);
     });
   }
+}
+
+/** A control of 1 may stand for more: "150 N m" is a factor of 150 and the unit "N m". */
+function measure({ unit }) {
+  const [, factor, rest] = /^([\d.]+) (.+)$/.exec(unit) ?? [null, 1, unit];
+  return { factor: Number(factor), unit: rest };
 }
 
 const digits = (value) => String(+value.toFixed(Math.abs(value) >= 100 ? 0 : Math.abs(value) >= 10 ? 1 : 2)).replace('-', '−');

@@ -31,13 +31,32 @@ export function keyMeaning(world, code) {
   return name + sign;
 }
 
+const MOVES = new Set(['forward', 'backward', 'back', 'left', 'right', 'up', 'down', 'north', 'south', 'east', 'west']);
+
+/** One word for what several keys do: "turn" of "turn left" and "turn right", "move" of directions alone. */
+function together(meanings) {
+  const rest = meanings.map((meaning) => meaning.split(/[\s:+−-]+/).filter((word) => word && !MOVES.has(word.toLowerCase())).join(' '));
+  return rest.every((words) => words === rest[0]) ? rest[0] || 'move' : meanings.length < 3 ? meanings.join(', ') : 'move';
+}
+
+/** What a person presses first: [[codes, word], ...]; deeds such as "attack", then what moves. */
+export function hintsOf(world) {
+  const single = Object.keys(world.keys).filter((code) => !code.includes('+')), groups = [[], []], deeds = [];
+  for (const code of single) if (PLACES[code]) groups[PLACES[code][0]].push(code); else deeds.push(code);
+  const place = (code) => PLACES[code][1] * 10 + PLACES[code][2], done = new Set();
+  const moves = groups.map((codes) => codes.sort((a, b) => place(a) - place(b)).filter((code) => !done.has(world.keys[code]) && done.add(world.keys[code])));
+  const spoken = deeds.sort((a, b) => (b === 'Space') - (a === 'Space')).slice(0, 3).map((code) => [[code], keyMeaning(world, code)]);
+  return [...spoken, ...moves.filter((codes) => codes.length).map((codes) => [codes, together(codes.map((code) => keyMeaning(world, code)))])];
+}
+
 /** Fills `root` with caps, as many as there is room for; a click on one calls `chosen(code)`, on the last, which is for all others, `chosen()`. Gives a function that lights up the held ones. */
 export function drawKeycaps(root, world, chosen) {
   root.replaceChildren();
   const groups = [0, 1, 2].map((number) => Object.assign(document.createElement('div'), { className: `cluster cluster-${number}` }));
-  const caps = new Map();
-  for (const code of Object.keys(world.keys)) {
-    if (code.includes('+')) continue; // several keys at once
+  const caps = new Map(), single = Object.keys(world.keys).filter((code) => !code.includes('+'));  // not several keys at once
+  for (const code of single.sort((one, other) => /^Arrow/.test(one) - /^Arrow/.test(other))) {
+    const same = [...caps.keys()].find((other) => PLACES[other]?.[0] === 0 && world.keys[other] === world.keys[code]);
+    if (same && PLACES[code]?.[0] === 1) { caps.set(code, caps.get(same)); continue; }  // an arrow that does the same as a letter
     const cap = document.createElement('kbd');
     const letter = document.createElement('b'), meaning = document.createElement('i');
     letter.textContent = keyLabel(code);
@@ -47,7 +66,8 @@ export function drawKeycaps(root, world, chosen) {
     cap.append(letter, meaning);
     const [group, row, column] = PLACES[code] ?? [2, 2, 0];
     if (column) { cap.style.gridRow = row; cap.style.gridColumn = column; }
-    groups[group].append(cap);
+    cap.classList.toggle('space', code === 'Space');
+    if (code === 'Space') groups[group].prepend(cap); else groups[group].append(cap);
     caps.set(code, cap);
   }
   for (const { children } of groups.slice(0, 2)) {  // left and right alone stand side by side
@@ -60,6 +80,7 @@ export function drawKeycaps(root, world, chosen) {
     more.onclick = () => chosen();
     rest.append(more);
   }
-  root.append(...groups.filter((group) => group.childElementCount));
-  return (held) => caps.forEach((cap, code) => cap.classList.toggle('held', held.includes(code)));
+  rest.style.setProperty('--rows', rest.childElementCount > 2 ? 2 : 1);
+  root.append(...[rest, groups[0], groups[1]].filter((group) => group.childElementCount));
+  return (held) => { const lit = held.map((code) => caps.get(code)); for (const cap of caps.values()) cap.classList.toggle('held', lit.includes(cap)); };
 }

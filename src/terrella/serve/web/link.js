@@ -50,7 +50,7 @@ export class Link {
     this.socket = socket;
     this.refused = '';
     socket.binaryType = 'arraybuffer';
-    this.hooks.state(this.everConnected ? 'reconnecting' : 'connecting');
+    if (this.attempt <= 2) this.hooks.state(this.everConnected ? 'reconnecting' : 'connecting');
     socket.onmessage = ({ data }) => (typeof data === 'string' ? this.onEvent(JSON.parse(data)) : this.onFrame(data));
     socket.onclose = (event) => this.onClose(event);
   }
@@ -93,7 +93,7 @@ export class Link {
       const why = await this.whyNot();
       if (why) return this.hooks.state('refused', why);
     }
-    this.hooks.state(this.everConnected ? 'reconnecting' : 'connecting');
+    this.hooks.state(this.attempt > 2 && this.everConnected ? 'away' : this.everConnected ? 'reconnecting' : 'connecting');
     this.timer = setTimeout(() => this.connect(), Math.min(4000, 250 * 2 ** this.attempt));
   }
 

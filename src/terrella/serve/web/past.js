@@ -23,6 +23,15 @@ export class Past {
     $('timeline').onpointerup = $('timeline').onpointercancel = (event) => { if (this.scrubbing && event.type === 'pointerup') { this.scrubbed = 0; this.scrub(event); } this.scrubbing = false; };
   }
 
+  /** A slider's keys: a tenth of a second, a second, and the ends; says whether the key was one of them. */
+  key(code) {
+    const { now } = this, second = Math.max(1, Math.round(1 / this.dt_s)), tenth = Math.max(1, Math.round(second / 10));
+    const to = { ArrowLeft: now.step - tenth, ArrowDown: now.step - tenth, ArrowRight: now.step + tenth, ArrowUp: now.step + tenth, PageDown: now.step - second, PageUp: now.step + second, Home: now.oldest, End: now.newest }[code];
+    if (to === undefined) return false;
+    if (this.why) this.toast(this.why); else this.seek(to);
+    return true;
+  }
+
   /** Takes a world; `why` it knows no way back, '' where it does. */
   take(world, why) {
     this.dt_s = world.dt_s;
@@ -51,6 +60,7 @@ export class Past {
     write('past-time', `−${((now.newest - now.step) * this.dt_s).toFixed(1)} s`);
     const line = $('timeline');
     line.ariaValueMin = now.oldest; line.ariaValueMax = now.newest; line.ariaValueNow = now.step;
+    line.ariaValueText = now.step === now.newest ? 'now' : `${((now.newest - now.step) * this.dt_s).toFixed(1)} seconds ago`;
   }
 
   seek(step) {

@@ -1,6 +1,7 @@
 // The pictures: a canvas for each world and camera, as large as fits, and a glow behind them.
 
 const GAP = 14;
+const AIM = '<svg class="aim" viewBox="0 0 26 26" aria-hidden="true"><path d="M13 3v6M13 17v6M3 13h6M17 13h6"/><path class="hit" d="M5 5l5 5M16 16l5 5M21 5l-5 5M10 16l-5 5"/></svg>';
 
 export class Screens {
   constructor(root, over, stage, glow) {
@@ -27,6 +28,7 @@ export class Screens {
       [canvas.height, canvas.width] = camera.size;
       figure.append(canvas);
       const caption = [world.label, this.cameras.length > 1 && camera.name].filter(Boolean).join(', ');
+      if (world.aims && !image.camera) figure.insertAdjacentHTML('beforeend', AIM);
       if (caption) figure.append(Object.assign(document.createElement('figcaption'), { textContent: caption }));
       this.canvases.set(key, { order: image.world * 256 + image.camera, figure, context: canvas.getContext('2d', { alpha: false }) });
     }
@@ -61,6 +63,15 @@ export class Screens {
     [...this.root.children].forEach(({ style }, at) => { [style.width, style.height] = stacked ? [`${column}px`, `${column / sizes[at]}px`] : [`${high * sizes[at]}px`, `${high}px`]; });
     this.over.style.width = `${stacked ? column : high * across + GAP * (count - 1)}px`;
     this.over.style.height = `${stacked ? column * down + 8 * (count - 1) : high}px`;
+  }
+
+  /** Something happened where one aims. */
+  strike() {
+    for (const cross of this.root.querySelectorAll('.aim')) {
+      cross.classList.remove('struck');
+      void cross.getBoundingClientRect();
+      cross.classList.add('struck');
+    }
   }
 
   flash() {
