@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import random
+from collections import Counter
 
 import numpy as np
 import pytest
 import torch
 
 from terrella.core.errors import ContractError
+from terrella.space.edits import apply_edits
 from terrella.space.kernels_numba.light import first_box
 from terrella.space.layout import build, looks, parse_text, read_layout, text_layout
 from terrella.space.layout.blocks import blocks_of
@@ -133,3 +135,72 @@ def test_what_is_built_is_whole_and_lit():
     assert 0.3 < grey.mean() < 0.8 and grey.std() > 0.05
     low, high = (torch.tensor(v) for v in (heard.layout.rooms[0].low, heard.layout.rooms[0].high))
     assert ((place.gaussians.means > low - 0.2) & (place.gaussians.means < high + 0.2)).all()
+
+
+def kinds(text: str) -> tuple[Counter, tuple[str, ...]]:
+    """How many things, doors, windows and rooms a text gives, and its words without effect."""
+    parsed = parse_text(text)
+    plan = parsed.layout
+    many = {"window": len(plan.windows), "door": len(plan.doors), "room": len(plan.rooms)}
+    return Counter(thing.label for thing in plan.things) + Counter(many), parsed.unknown
+
+
+@pytest.mark.parametrize(
+    ("text", "counts", "unknown"),
+    [
+        ("a hall with pillars and big windows", {"pillar": 4, "window": 3, "door": 0}, ()),
+        ("a room with two doors", {"door": 2}, ()),
+        ("a study without windows or doors and a lamp", {"window": 0, "door": 0, "lamp": 1}, ()),
+        ("a room with no window", {"window": 0}, ()),
+        ("a kitchen with a dozen stools", {"stool": 12}, ()),
+        ("a room with thirteen boxes", {"box": 13}, ()),
+        ("three bedrooms with a window", {"room": 3, "window": 3, "door": 2}, ()),
+        ("two pillars in a hall", {"room": 1, "pillar": 2}, ()),
+        ("a hall and a kitchen. in the hall a table", {"room": 2, "table": 1}, ()),
+        ("a room with a table and a lamp on the table", {"table": 1, "lamp": 1}, ("on",)),
+        ("a room with a red gizmo and a table", {"table": 1}, ("gizmo", "red")),
+        ("a hall with tall pillars", {"pillar": 4}, ("tall",)),
+        ("a room with long stairs", {}, ("long",)),
+        ("a room with windows on every wall", {"window": 3}, ("every",)),
+        ("a room that is big", {"room": 1}, ("big",)),
+        ("a room with a window in the corner", {"window": 1}, ("corner",)),
+    ],
+)
+def test_every_word_has_an_effect_or_is_named(text, counts, unknown):
+    has, without_effect = kinds(text)
+    assert {label: has[label] for label in counts} == counts and without_effect == unknown
+
+
+def test_sizes_of_openings_and_surfaces_are_seen():
+    windows = {word: parse_text(f"a hall with a {word} window").layout.windows[0] for word in ("blue", "big", "small")}
+    assert windows["big"].width > 1.5 * windows["blue"].width > 2 * windows["small"].width
+    assert windows["big"].height > 1.3 * windows["blue"].height > 1.5 * windows["small"].height
+    doors = {word: parse_text(f"a hall with a {word} door").layout.doors[0] for word in ("red", "wide", "tall")}
+    assert doors["wide"].width > 1.4 * doors["red"].width and doors["tall"].height > 1.3 * doors["red"].height
+    rooms = [
+        parse_text(f"a room with {words}").layout.rooms[0] for words in ("a lamp", "a tall ceiling", "a wide floor")
+    ]
+    assert rooms[1].size[2] > 1.3 * rooms[0].size[2] and rooms[2].size[1] > 1.4 * rooms[0].size[1]
+    assert parse_text("a room with a wide picture").layout.things[0].size[0] > 1.3  # type: ignore[index]
+
+
+def test_what_is_too_much_is_named():
+    parsed = parse_text("a hall with 100 chairs and thirty rooms")
+    assert dict(part.split()[::-1] for part in parsed.left_out)["chair"] >= "76"
+    assert "thirty" in parsed.unknown
+    assert parse_text("40 rooms").unknown == ("40 rooms",) and len(parse_text("40 rooms").layout.rooms) == 12
+
+
+@pytest.mark.parametrize("deed", [{"do": "delete"}, {"do": "move", "by": [0, 0, 9]}])
+def test_behind_every_object_lies_a_surface(deed):
+    place = build(
+        parse_text("a room with a pillar, a window, a door, a wardrobe in the corner and a rug").layout, 12_000
+    )
+    pose = place.starts.clone()
+    pose[:, 2] += 1.6
+    assert 0.01 < place.hidden.float().mean() < 0.3
+    for number, name in enumerate(place.names, 1):
+        after = apply_edits(place.gaussians, [{"select": {"object": number}, **deed}], place.objects).gaussians
+        assert rasterise(after, pose, None, (64, 128)).alpha.min() > 0.85, name
+    shown = rasterise(place.gaussians, pose, None, (64, 128))
+    assert not place.hidden[shown.ids[shown.ids >= 0].long()].float().mean() > 0.001

@@ -14,6 +14,7 @@ from terrella.space.camera import planar_pose
 from terrella.space.occupancy import Walker
 from terrella.space.solids import Solids
 from terrella.worlds.folder import open_world
+from terrella.worlds.splat_folder import save_splat
 
 LAYOUT = {
     "rooms": [{"name": "hall", "at": [0, 0], "size": [8, 4, 3.4]}, {"name": "den", "at": [8.2, 0], "size": [3, 4, 3]}],
@@ -113,6 +114,29 @@ def test_the_command_says_what_it_did_not_understand(tmp_path, capsys):
     for wrong in (["--text", "quux"], [], [str(tmp_path / "none.json")], ["--text", "room", "--gaussians", "3"]):
         assert main(["space", "build", *wrong, "--out", str(tmp_path / "no")]) != 0
         assert not (tmp_path / "no").exists() and len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_built_place_has_a_name_and_is_known(tmp_path):
+    words, out = "a small room with a pillar", tmp_path / "w"
+    assert main(["space", "build", words, "--out", str(out), "--gaussians", "1500"]) == 0
+    world = open_world(out)
+    assert world.name == words and (tmp_path / "w" / "layout.json").exists()
+    shown = world.render(world.start(1, rng := torch.Generator().manual_seed(0)), ("uncertainty",))["uncertainty"]
+    sure = world.spec.card["uncertainty"]["sure"]
+    assert float(shown) < sure
+    assert main(["space", "edit", str(out), "--object", "1", "--delete"]) == 0
+    edited = open_world(out)
+    assert not edited.provenance.bool().all()  # what the pillar hid counts as invented
+    plain = {"rooms": LAYOUT["rooms"][:1]}
+    (tmp_path / "den.json").write_text(json.dumps(plain))
+    assert (
+        main(["space", "build", str(tmp_path / "den.json"), "--out", str(tmp_path / "d"), "--gaussians", "1500"]) == 0
+    )
+    assert open_world(tmp_path / "d").name == "den"
+    world.provenance.zero_()  # as an older release saved what words built
+    save_splat(world, tmp_path / "old")
+    old = open_world(tmp_path / "old")
+    assert float(old.render(old.start(1, rng), ("uncertainty",))["uncertainty"]) < sure
 
 
 def test_it_is_exported_to_other_tools(folder, tmp_path, capsys):

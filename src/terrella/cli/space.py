@@ -35,20 +35,20 @@ def fit(
 
 
 def build(
-    layout: Annotated[Path | None, Positional, arg(metavar="[LAYOUT]")] = None,
+    source: Annotated[str | None, Positional, arg(metavar="[WORDS|LAYOUT]")] = None,
     *,
     out: Path,
     config: BuildSpaceConfig,
     json: Json = False,
 ) -> None:
-    """Make a place to walk in from a layout.json (rooms, doors, windows, stairs, furniture), from the triangles of a .glb or
-    .gltf, or from words. The same seed gives the same bytes.
+    """Make a place to walk in from words, from a layout.json (rooms, doors, windows, stairs, furniture), or from the triangles of
+    a .glb or .gltf. The same seed gives the same bytes.
 
     Args:
-        layout: The layout, or the .glb or .gltf.
+        source: Words ("a long room with two pillars and a red door"), or the layout.json, .glb or .gltf.
         out: Folder of the world.
     """
-    show(build_space(layout, out, config), json)
+    show(build_space(source, out, config), json)
 
 
 def import_(

@@ -37,7 +37,7 @@ class BuildSpaceConfig:
     """How a place is built."""
 
     text: str | None = None
-    """Words instead of a layout: "a long room with two pillars and a red door". Their layout is saved as OUT/layout.json."""
+    """Words instead of a file: "a long room with two pillars and a red door". Their layout is saved as OUT/layout.json."""
     gaussians: int = 120_000  # Approximate number of Gaussians.
     seed: int | None = None  # Seed of everything that the words or the layout leave open.
     size: tuple[int, int] = (192, 256)  # Height and width of the pictures, in pixels.
@@ -103,23 +103,40 @@ def import_space(file: Path, out: Path, config: ImportSpaceConfig, *, progress: 
     return SpaceResult(facts, (f"{len(gaussians):,} Gaussians; terrella play {out}",))
 
 
-def build_space(layout: Path | None, out: Path, config: BuildSpaceConfig) -> SpaceResult:
+def build_space(source: str | Path | None, out: Path, config: BuildSpaceConfig) -> SpaceResult:
     """Builds a world of a layout.json, of the triangles of a .glb or .gltf, or of words. The same seed gives the same bytes."""
-    if (layout is None) == (config.text is None):
-        raise TerrellaError('give a layout.json or a .glb, or --text "a long room with two pillars and a red door".')
+    layout, text = _layout_or_words(source)
+    if (layout is None) == (text is None and config.text is None) or (text and config.text):
+        raise TerrellaError('give words ("a long room with two pillars and a red door"), a layout.json or a .glb.')
     if not 1000 <= config.gaussians <= 2_000_000 or not _is_size(config.size):
         raise TerrellaError("--gaussians is from 1,000 to 2,000,000, and --size from 8 to 4096 pixels a side.")
     if layout is not None and layout.suffix.lower() in GLTF_ENDINGS:
         return _of_triangles(read_gltf(layout), layout, out, config.gaussians, config.size)
     if layout is None:
-        parsed = parse_text(config.text or "", config.seed or 0)
+        parsed = parse_text(text or config.text or "", config.seed or 0)
     else:
         rooms = read_layout(layout)
+        rooms = rooms if rooms.name else replace(rooms, name=_file_name(layout))
         rooms = rooms if config.seed is None else replace(rooms, seed=config.seed)
         parsed = ParsedText(rooms, asdict(rooms), (), ())
     place = build(parsed.layout, config.gaussians)
     _save_built(place, parsed, out, config)
     return _built_result(place, parsed, out)
+
+
+def _layout_or_words(source: str | Path | None) -> tuple[Path | None, str | None]:
+    """A file, or words: whatever is no file and does not end like one."""
+    if source is None:
+        return None, None
+    file = Path(source)
+    words = isinstance(source, str) and not file.exists() and file.suffix.lower() not in (".json", *GLTF_ENDINGS)
+    return (None, str(source)) if words else (file, None)
+
+
+def _file_name(file: Path) -> str:
+    """The name of a place that a file describes: the file's, or that of its folder if it is a layout.json."""
+    folder = file.resolve().parent.name
+    return folder if file.name == LAYOUT_FILE and folder else file.stem
 
 
 def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResult:
@@ -143,9 +160,8 @@ def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResu
 def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildSpaceConfig) -> None:
     starts = place.starts.clone()
     starts[:, 2] += WALKER.eye_m
-    provenance = OBSERVED if config.text is None else INVENTED  # a layout states everything, words leave much open
-    card = {"objects": list(place.names), **({"text": config.text} if config.text else {})}
-    origin = torch.full((len(place.gaussians),), provenance, dtype=torch.uint8)
+    card = {"objects": list(place.names), **({"text": parsed.text} if parsed.text else {})}
+    origin = torch.where(place.hidden, INVENTED, OBSERVED).to(torch.uint8)
     world = SplatWorld(
         parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,
         SolidBoxes(place.solids, place.bodies),

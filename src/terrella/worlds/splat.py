@@ -37,6 +37,7 @@ _PUSH = torch.tensor(
     [[1, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 0], [0, 0, 0, 1], [0, 0, 0, -1]]
 ).float()
 GRAVITY = 9.81  # m/s^2
+LEVELS = {"sure": 0.1, "invents": 0.5}  # of the channel `uncertainty`, a share of the picture
 MOST_PLACES = 8192  # rows of the channel `places`
 
 
@@ -70,7 +71,8 @@ class SolidBoxes(NamedTuple):
 
 @final
 class SplatWorld:
-    """Gaussians with a provenance each, uint8 [N] (OBSERVED or INVENTED), and `starts` [S, 7], poses in which episodes begin.
+    """Gaussians with a provenance each, uint8 [N] (OBSERVED: seen, or built as asked; INVENTED: added, or changed by an edit), and
+    `starts` [S, 7], poses in which episodes begin.
     `objects` int32 [N]: the object of each Gaussian (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies collide
     with `solids`, or without any with what the Gaussians fill. Where MuJoCo is installed, objects that can be pushed are rigid
     bodies that carry their Gaussians; the channel `bodies` [K, 7] has their poses, in the order of the objects.
@@ -130,7 +132,7 @@ class SplatWorld:
             action_names=buttons,
             keys={k: [float(one == name) for one in buttons] for k, name in KEYS.items() if name in buttons},
             cameras={"rgb": Camera(self.config.camera, self.config.size)},
-            card={"kind": "splat", **self.card},
+            card={"kind": "splat", "uncertainty": LEVELS, **self.card},
         )
 
     @property

@@ -82,6 +82,8 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         config = SplatConfig(**{**settings, "body": Walker(**settings["body"])})
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
+        if about["card"].get("text") and not provenance.any():  # an older release marked all of what words built
+            provenance = torch.full_like(provenance, OBSERVED)
         solids, bodies = tensors.pop("solids", None), tensors.pop("bodies", None)
         shapes = (
             provenance.shape == objects.shape == tensors["means"].shape[:1] and starts.shape[1:] == (7,) and len(starts)

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,8 @@ def fit_splat(
     """
     out, began = Path(out), time.monotonic()
     _check(config)
+    name = config.name or Path(data).stem or Path(data).resolve().stem
+    config = replace(config, name=config.name or "place")  # as in the recipes of earlier runs
     views, spec, left_out = read_views(data, out, config)
     held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
     seen, tested = views.at(~held), views.at(held)
@@ -68,7 +70,7 @@ def fit_splat(
         start, now = time.monotonic(), fit.gaussians.each(lambda part: part.detach().clone())
         db = float(psnr(now, tested.at(torch.arange(len(tested))[:: max(len(tested) // LOOKED_AT, 1)])).mean())
         facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
-        watch(lambda: _world(now, seen, spec, config, {}), facts)
+        watch(lambda: _world(now, seen, spec, name, {}), facts)
         return start + max(LOOK_S, LOOK_SHARE * (time.monotonic() - start))
 
     try:
@@ -81,7 +83,7 @@ def fit_splat(
     if not finished:  # else it may have been edited since
         _save(out / RESUME, fit, recipe)
         card = {"data": str(data), "left_out": left_out, **figures}
-        save_splat(_world(fit.gaussians, seen, spec, config, card), out / "world")
+        save_splat(_world(fit.gaussians, seen, spec, name, card), out / "world")
     return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
@@ -126,7 +128,7 @@ def _figures(fit: Fit, seen: PosedViews, tested: PosedViews) -> dict[str, Any]:
 
 
 def _world(
-    gaussians: Gaussians, seen: PosedViews, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
+    gaussians: Gaussians, seen: PosedViews, spec: Mapping[str, Any], name: str, card: dict[str, Any]
 ) -> SplatWorld:
     """The world of a fit, with a walker whose eyes are as high above the floor as the recording's camera."""
     gaussians = gaussians.at(gaussians.opacities > 0.01)
@@ -137,7 +139,7 @@ def _world(
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     starts = seen.pose[:: max(len(seen) // 64, 1)]
     made = SplatConfig(seen.camera, seen.size, body=body)
-    return SplatWorld(config.name, gaussians, observed, starts, made, {"game": str(spec.get("name", "")), **card})
+    return SplatWorld(name, gaussians, observed, starts, made, {"game": str(spec.get("name", "")), **card})
 
 
 def _save(path: Path, fit: Fit, recipe: dict[str, str]) -> None:

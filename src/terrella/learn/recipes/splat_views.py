@@ -27,7 +27,7 @@ AGREEMENT = 0.08  # share of pixels whose depth agrees between views: with less 
 class SplatFit:
     """Settings of a fit."""
 
-    name: str = "place"  # Name of the world.
+    name: str = ""  # Name of the world. Default: that of the data.
     frames: int = 300  # Pictures taken from the recording, the folder or the video, evenly spread.
     # Number of episodes to use, from the first. Default: all.
     episodes: int | None = None

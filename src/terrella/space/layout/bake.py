@@ -2,6 +2,7 @@
 light of lamps, windows and the sun, and of three bounces between texels."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,7 @@ class BuiltPlace:
     solids: torch.Tensor  # float32 [S, 6], boxes that stop walkers
     bodies: torch.Tensor  # int32 [S], the movable object of each box (0: none)
     starts: torch.Tensor  # float32 [R, 7], a pose in each room, at the height of its floor
+    hidden: torch.Tensor  # bool [N], the Gaussians that objects hide until they are moved or deleted
 
 
 @dataclass
@@ -69,15 +71,17 @@ def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
     fine = np.array([FINE.get(look.material, 1.0) for look in blocks.looks])
     apart = math.sqrt((area * fine[texels.blocks]).sum() / count)
     spacing = np.clip(apart / np.sqrt(fine), FINEST_M, 0.3)
-    cells = _some(_grid(boxes, spacing), boxes, air, bodies)
+    objects = np.asarray(blocks.objects, np.int32)
+    cells, hidden = _surfaces(_grid(boxes, spacing), boxes, air, objects)
     colours = _brightness(plan, blocks, boxes, cells, texels, bare, light)
     return BuiltPlace(
         _gaussians(cells, colours),
-        torch.from_numpy(np.asarray(blocks.objects, np.int32)[cells.blocks]),
+        torch.from_numpy(objects[cells.blocks]),
         tuple(blocks.names),
         torch.from_numpy(blocks.solids),
         torch.from_numpy(bodies[np.asarray(blocks.solid)]),
         _starts(plan, blocks),
+        torch.from_numpy(hidden),
     )
 
 
@@ -119,13 +123,15 @@ def _in(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _some(grid: _Grid, boxes: np.ndarray, air: np.ndarray, bodies: np.ndarray) -> _Grid:
-    """The cells that are visible, now or after objects were pushed away."""
-    bare, whose = _bare(grid, boxes[bodies == 0], air), bodies[grid.blocks]
-    for number in np.unique(bodies[bodies > 0]):
+def _surfaces(grid: _Grid, boxes: np.ndarray, air: np.ndarray, objects: np.ndarray) -> tuple[_Grid, np.ndarray]:
+    """The cells that are visible, now or after objects [K] were moved or deleted, and which of them are hidden now."""
+    whose = objects[grid.blocks]
+    bare, kept = _bare(grid, boxes, air), _bare(grid, boxes[objects == 0], air)
+    for number in range(1, objects.max(initial=0) + 1):
         rows = np.flatnonzero(whose == number)
-        bare[rows] = ~_in(grid.points[rows] + 0.004 * grid.normals[rows], boxes[bodies == number])
-    return _Grid(grid.points[bare], grid.sides[bare], grid.blocks[bare], grid.widths[bare], grid.starts, grid.counts)
+        kept[rows] = ~_in(grid.points[rows] + 0.004 * grid.normals[rows], boxes[objects == number])
+    cells = _Grid(grid.points[kept], grid.sides[kept], grid.blocks[kept], grid.widths[kept], grid.starts, grid.counts)
+    return cells, ~bare[kept]
 
 
 def _light(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
@@ -165,15 +171,37 @@ def _narrow(grid: _Grid, boxes: np.ndarray) -> np.ndarray:
 
 def _smooth(grid: _Grid, bare: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values [T, 3] smoothed twice over visible neighbours on the same side."""
-    for first, (rows, columns) in zip(grid.starts, grid.counts):
-        part = slice(first, first + rows * columns)
-        open_ = np.pad(bare[part].reshape(rows, columns, 1).astype(float), ((1, 1), (1, 1), (0, 0)))
-        for _ in range(2 if open_.any() else 0):
-            held = np.pad(values[part].reshape(rows, columns, 3), ((1, 1), (1, 1), (0, 0))) * open_
-            total = sum(held[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
-            weight = sum(open_[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
-            values[part] = (total / np.maximum(weight, 1)).reshape(-1, 3)
+    for part, shape in _sides_of(grid):
+        for _ in range(2 if bare[part].any() else 0):
+            values[part], _ = _neighbours(values[part], bare[part], shape)
     return values
+
+
+def _carried(grid: _Grid, bare: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values [T, 3] of visible texels, carried on to the hidden ones of the same side; bool [T], which texels have one then."""
+    values, known = values.copy(), bare.copy()
+    for part, shape in _sides_of(grid):
+        while known[part].any() and not known[part].all():
+            means, several = _neighbours(values[part], known[part], shape)
+            fresh = (several > 0) & ~known[part]
+            values[part][fresh], known[part] = means[fresh], several > 0
+    return values, known
+
+
+def _sides_of(grid: _Grid) -> Iterator[tuple[slice, tuple[int, int]]]:
+    """The rows of each side, and its cells along both axes."""
+    for first, (rows, columns) in zip(grid.starts, grid.counts):
+        yield slice(first, first + rows * columns), (rows, columns)
+
+
+def _neighbours(values: np.ndarray, known: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The means [n, 3] of known values around each cell of one side (0 without any), and how many these are [n]."""
+    rows, columns = shape
+    open_ = np.pad(known.reshape(rows, columns, 1).astype(float), ((1, 1), (1, 1), (0, 0)))
+    held = np.pad(values.reshape(rows, columns, 3), ((1, 1), (1, 1), (0, 0))) * open_
+    total = sum(held[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
+    weight = sum(open_[i : i + rows, j : j + columns] for i in range(3) for j in range(3))
+    return (total / np.maximum(weight, 1)).reshape(-1, 3), np.asarray(weight).ravel()
 
 
 def _direct(plan, blocks, boxes, points, normals, areas, glow) -> np.ndarray:
@@ -248,7 +276,25 @@ def _sun_on(plan, blocks, boxes, grid) -> np.ndarray:
 
 
 def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Values [T, 3] of visible texels interpolated at cells of the same side: [N, 3]."""
+    """Values [T, 3] of visible texels interpolated at cells of the same side: [N, 3]. Hidden cells get those around them, or
+    the mean of their block."""
+    near, weight = _interpolated(cells, texels, bare, values, boxes)
+    if (weight <= 0).any():
+        carried, known = _carried(texels, bare, values)
+        beneath, some = _interpolated(cells, texels, known, carried, boxes)
+        total, count = np.zeros((len(boxes), 3)), np.zeros(len(boxes))
+        np.add.at(total, texels.blocks[bare], values[bare])
+        np.add.at(count, texels.blocks[bare], 1)
+        means = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], values[bare].mean(0))
+        beneath = np.where(some[:, None] > 0, beneath, means[cells.blocks])
+        near = np.where(weight[:, None] > 0, near, beneath)
+    return near
+
+
+def _interpolated(
+    cells: _Grid, texels: _Grid, known: np.ndarray, values: np.ndarray, boxes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values of the known among the four texels around each cell [N, 3], and their weight [N], 0 without any."""
     face = 6 * cells.blocks + cells.sides
     axes = np.array(_AXES)[cells.sides // 2]
     rows = np.arange(len(face))
@@ -264,18 +310,10 @@ def _between(cells: _Grid, texels: _Grid, bare: np.ndarray, values: np.ndarray, 
             a, b = (np.clip(first[:, c] + d, 0, many[:, c] - 1) for c, d in ((0, i), (1, j)))
             texel = start + a * many[:, 1] + b
             w = (share[:, 0] if i else 1 - share[:, 0]) * (share[:, 1] if j else 1 - share[:, 1]) + 1e-4
-            w = w * bare[texel]
+            w = w * known[texel]
             total += w[:, None] * values[texel]
             weight += w
-    near = total / np.maximum(weight, 1e-9)[:, None]
-    lost = weight <= 0
-    if lost.any():  # none of the four is bare: the mean of its block
-        total, count = np.zeros((len(boxes), 3)), np.zeros(len(boxes))
-        np.add.at(total, texels.blocks[bare], values[bare])
-        np.add.at(count, texels.blocks[bare], 1)
-        means = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], values[bare].mean(0))
-        near[lost] = means[cells.blocks[lost]]
-    return near
+    return total / np.maximum(weight, 1e-9)[:, None], weight
 
 
 def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:

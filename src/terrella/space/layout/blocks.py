@@ -213,6 +213,8 @@ def _window(blocks: Blocks, plan: RoomLayout, window: Window, holes: dict) -> No
     holes.setdefault((room.name, window.wall), []).append((a0, a1, z0, z1))
     blocks.air.append(wall.box((a0, a1), (0, WALL_M), (z0, z1)))
     blocks.add(*wall.box((a0, a1), (WALL_M - 0.03, WALL_M), (z0, z1)), look_of("glass"), thing)
+    shut = wall.box((a0, a1), (WALL_M, WALL_M + 0.02), (z0, z1))  # the wall without the window
+    blocks.add(*shut, look_of(room.walls), solid=False)
     f, depth = FRAME_M, (-0.02, WALL_M - 0.03)
     for span in ((a0, a0 + f), (a1 - f, a1)):
         blocks.add(*wall.box(span, depth, (z0, z1)), look, thing)

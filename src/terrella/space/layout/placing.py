@@ -2,13 +2,16 @@
 
 import math
 import random
+from collections import Counter
 from collections.abc import Iterator, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any
 
 from .furniture import kind_of
 
 _SIDES = ("north", "south", "east", "west")
 _FRONT = {"north": "south", "south": "north", "east": "west", "west": "east"}  # who stands at a wall looks away from it
+MOST_EACH = 24
 SLOT_M = 1.2  # of a wall, for each door or window
 CLEAR_M = 0.9  # before doors
 APART_M = 0.7  # between things, so that bodies pass
@@ -19,33 +22,49 @@ _STAIRS_M, _LANDING_M = (
 Rect = tuple[float, float, float, float]
 
 
-class FurnitureRequest(Protocol):
+@dataclass
+class FurnitureRequest:
+    """A thing in a text: its kind, how many, its look, its size relative to the usual, and where."""
+
     label: str
     count: int
     look: str
     scale: tuple[float, float, float]
-    side: str
+    side: str = ""
 
 
-def furnish_room(
-    layout: dict[str, Any], number: int, requests: Sequence[FurnitureRequest], following: bool, seed: int
-) -> list[str]:
-    """Adds the requested things to room `number` of a layout, and a door to the next room. Returns the labels without a place."""
-    room = layout["rooms"][number]
-    return _Room(layout, room, random.Random(1000 * seed + number)).fill(requests, number > 0, following)
+def furnish_room(layout: dict[str, Any], number: int, requests: Sequence[FurnitureRequest], seed: int) -> list[str]:
+    """Adds the requested things to room `number` of a layout, and a door to the next room. Returns those without a place, such as
+    "2 chair"."""
+    room, following = _Room(layout, number, random.Random(1000 * seed + number)), number + 1 < len(layout["rooms"])
+    lost = Counter({one.label: 0 for one in requests})
+    for one in requests:
+        lost[one.label] += max(one.count - MOST_EACH, 0)
+    for label, count in room.fill(
+        [replace(one, count=min(one.count, MOST_EACH)) for one in requests], number > 0, following
+    ):
+        lost[label] += count
+    return [f"{count} {label}" for label, count in lost.items() if count]
+
+
+def across_and_up(scale: tuple[float, float, float]) -> tuple[float, float]:
+    """How much wider and higher an opening is: big ones both, wide ones wider, tall ones higher."""
+    return scale[0] * scale[1], scale[2] * (scale[0] if scale[0] == scale[1] else 1.0)
 
 
 class _Room:
-    def __init__(self, layout: dict[str, Any], room: dict[str, Any], rng: random.Random):
-        self.layout, self.room, self.rng = layout, room, rng
+    def __init__(self, layout: dict[str, Any], number: int, rng: random.Random):
+        self.layout, self.room, self.rng = layout, layout["rooms"][number], rng
+        room = self.room
+        self.joined = [room["size"], *(one["size"] for one in layout["rooms"][number + 1 : number + 2])]
         (self.x0, self.y0, _), (w, d, self.height) = room["at"], room["size"]
         self.x1, self.y1 = self.x0 + w, self.y0 + d
         self.taken: list[Rect] = []  # where things stand
         self.clear: list[Rect] = []  # where nothing may
         self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
 
-    def fill(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
-        """Openings first, then the largest things."""
+    def fill(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[tuple[str, int]]:
+        """Openings first, then the largest things. Returns how many of which have no place."""
         middle = (self.y0 + self.y1) / 2
         if entered:
             self.clear.append((self.x0, middle - 0.6, self.x0 + CLEAR_M + 0.2, middle + 0.6))
@@ -60,36 +79,37 @@ class _Room:
         for one in rest:
             done = self._place(one)
             if done < one.count:
-                lost.append(f"{one.count - done} {one.label}")
+                lost.append((one.label, one.count - done))
         return lost
 
-    def _openings(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[str]:
+    def _openings(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[tuple[str, int]]:
         """Adds doors and windows, spread evenly over each wall; returns those for which it is too short."""
         on: dict[str, list[FurnitureRequest]] = {side: [] for side in _SIDES}
         joined = [side for side, present in (("east", following), ("west", entered)) if present]
         free = [side for side in ("east", "north", "south", "west") if side not in joined]
         first = following
         if following:
-            self._door("east", None, next((one.look for one in requests if one.label == "door"), ""))
+            self._door("east", None, next((one for one in requests if one.label == "door"), None))
         for one in requests:
             count = one.count - (first and one.label == "door")
             first = first and one.label != "door"
+            fits = max(int(self._length("south") / (1.5 * across_and_up(one.scale)[0] + 0.6)), 1)
             for k in range(count):
                 if one.side in free:
                     side = one.side
                 elif one.label == "door":
                     side = next((s for s in free if not any(other.label == "door" for other in on[s])), "north")
                 else:
-                    side = "south" if k < max(int(self._length("south") / (2.1 * one.scale[0])), 1) else "north"
+                    side = "south" if k < fits else "north"
                 on[side].append(one)
         lost = []
         for side, several in on.items():
             fit = several[: max(int(self._length(side) / SLOT_M), 1)]
-            lost += [f"1 {one.label}" for one in several[len(fit) :]]
+            lost += [(one.label, 1) for one in several[len(fit) :]]
             for k, one in enumerate(fit):
                 at = round(self._length(side) * (k + 0.5) / len(fit), 3)
                 if one.label == "door":
-                    self._door(side, at, one.look)
+                    self._door(side, at, one, len(fit))
                 else:
                     self._window(side, at, one, len(fit))
         return lost
@@ -97,24 +117,33 @@ class _Room:
     def _length(self, side: str) -> float:
         return self.y1 - self.y0 if side in ("east", "west") else self.x1 - self.x0
 
-    def _door(self, side: str, at: float | None, look: str) -> None:
+    def _door(self, side: str, at: float | None, request: FurnitureRequest | None, several: int = 1) -> None:
+        sizes = self.joined if at is None else self.joined[:1]  # a door to the next room fits both
+        across, up = across_and_up(request.scale) if request else (1.0, 1.0)
+        most = min(one[1] for one in sizes) if at is None else self._length(side) / several
+        width = round(max(min(0.95 * across, most - 0.2), 0.7), 2)
+        height = round(min(2.1 * up, min(one[2] for one in sizes) - 0.05), 2)
         one = {
             "room": self.room["name"],
             "wall": side,
-            **({"look": look} if look else {}),
+            "width": width,
+            "height": max(height, 1.9),
+            **({"look": request.look} if request and request.look else {}),
             **({"at": at} if at else {}),
         }
         self.layout["doors"].append(one)
         middle = self._length(side) / 2 if at is None else at
-        self.clear.append(self._before(side, middle - 0.6, middle + 0.6, CLEAR_M + 0.1))
+        half = max(0.6, width / 2 + 0.1)
+        self.clear.append(self._before(side, middle - half, middle + half, CLEAR_M + 0.1))
 
     def _window(self, side: str, at: float, one: FurnitureRequest, several: int) -> None:
-        width = round(min(1.5 * one.scale[0], self._length(side) / several - 0.3), 2)
-        height = round(min(1.3 * one.scale[2], self.height - 1.1), 2)
+        across, up = across_and_up(one.scale)
+        width = round(min(1.5 * across, self._length(side) / several - 0.3), 2)
+        height = round(min(1.3 * up, self.height - 0.6), 2)
+        sill = round(min(0.9, max(self.height - height - 0.3, 0.2)), 2)
         look = {"look": one.look} if one.look else {}
-        self.layout["windows"].append(
-            {"room": self.room["name"], "wall": side, "at": at, "width": width, "height": height, **look}
-        )
+        wall = {"room": self.room["name"], "wall": side, "at": at}
+        self.layout["windows"].append({**wall, "width": width, "height": height, "sill": sill, **look})
 
     def _before(self, side: str, low: float, high: float, deep: float) -> Rect:
         """The floor in front of a part of a wall."""
@@ -129,7 +158,12 @@ class _Room:
         if one.label == "stairs":
             return sum(self._stairs(one) for _ in range(one.count))
         kind, done = kind_of(one.label), 0
-        size = tuple(round(a * b, 3) for a, b in zip(kind.size, one.scale))
+        scale = one.scale
+        if (
+            kind.stands in ("wall", "hung") and scale[0] != scale[1]
+        ):  # seen from the front: wide ones are wider, not deeper
+            scale = (scale[0] * scale[1], 1.0, scale[2])
+        size = tuple(round(a * b, 3) for a, b in zip(kind.size, scale))
         height = min(size[2], self.height - (1.35 if kind.stands == "hung" else 0))
         size = (size[0], size[1], round(height, 3))
         spots = self._row(one.count, size) if one.label in ("pillar", "rug", "table") and not one.side else []

@@ -98,7 +98,7 @@ class RoomLayout:
     stairs: tuple[Stairs, ...] = ()
     things: tuple[Thing, ...] = ()
     start: tuple[float, float, float] | None = None  # x, y and heading in degrees (0 east, 90 north)
-    name: str = "place"
+    name: str = ""  # default: the file's
     seed: int = 0
     sun: tuple[float, float] | None = (215.0, 42.0)  # its heading and its height above the horizon, degrees
 

@@ -12,7 +12,7 @@ from typing import Any
 from ...core.errors import ContractError
 from . import looks
 from .furniture import KINDS, SAME
-from .placing import furnish_room
+from .placing import FurnitureRequest, furnish_room
 from .room_layout import RoomLayout, read_layout
 
 ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in metres, and looks
@@ -31,13 +31,17 @@ ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in
     "garden": {"size": (11.0, 9.0, 4.5), "floor": "grass", "walls": "stone", "ceiling": "sky"},
 }
 SIZES = {
-    "long": (1.7, 1, 1), "short": (0.7, 1, 1), "wide": (1, 1.5, 1), "narrow": (1, 0.65, 1), "tall": (1, 1, 1.4),
-    "high": (1, 1, 1.4),
-    "low": (1, 1, 0.85), "big": (1.3, 1.3, 1.1), "large": (1.3, 1.3, 1.1), "huge": (1.8, 1.8, 1.4), "small": (0.75, 0.75, 1),
-    "tiny": (0.6, 0.6, 0.95),
+    "long": (1.7, 1, 1), "short": (0.7, 1, 1), "wide": (1, 1.5, 1), "broad": (1, 1.5, 1), "narrow": (1, 0.65, 1),
+    "tall": (1, 1, 1.4), "high": (1, 1, 1.4), "low": (1, 1, 0.8), "big": (1.3, 1.3, 1.1), "large": (1.3, 1.3, 1.1),
+    "huge": (1.8, 1.8, 1.4), "giant": (1.8, 1.8, 1.4), "enormous": (1.8, 1.8, 1.4), "small": (0.75, 0.75, 1),
+    "little": (0.75, 0.75, 1), "tiny": (0.6, 0.6, 0.95),
 }  # fmt: skip
-NUMBERS = {"a": 1, "an": 1, "one": 1, "two": 2, "three": 3, "four": 4, "five": 5, "six": 6, "seven": 7, "eight": 8, "nine": 9,
-           "ten": 10, "twelve": 12, "some": 3, "few": 3, "several": 4, "pair": 2}  # fmt: skip
+_ONES = ("zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen "
+         "nineteen twenty")  # fmt: skip
+NUMBERS = {**{word: at for at, word in enumerate(_ONES.split())}, "a": 1, "an": 1, "single": 1, "some": 3, "few": 3,
+           "several": 4, "many": 6, "lots": 6}  # fmt: skip
+GROUPS = {"pair": 2, "pairs": 2, "couple": 2, "dozen": 12, "dozens": 12, "hundred": 100}
+PLURALS = {"pillar": 4, "chair": 4, "door": 2, "stairs": 1, "room": 2}  # how many without a number; of others 3
 SIDES = {"left": "north", "right": "south", "far": "east", "back": "east", "end": "east", "near": "west", "front": "west",
          "north": "north", "south": "south", "east": "east", "west": "west", "middle": "middle", "centre": "middle",
          "center": "middle", "corner": "corner"}  # fmt: skip
@@ -46,30 +50,28 @@ _SAME = {**SAME, "hallway": "corridor", "passage": "corridor", "office": "study"
          "shelves": "bookshelf", "bookshelves": "bookshelf"}  # fmt: skip
 _SURFACES = ("floor", "walls", "ceiling")
 _PLACES = ("on", "in", "at", "by", "to", "against")
-_QUIET = {*_PLACES, *"with and the of then there is are has have its it that which next beside behind beyond through from into "
-          "leads leading lead another other side sides each very with, also plus both "
-          "opens onto where stands stand full".split()}  # fmt: skip
+_RELATIONS = {*_PLACES, *"next beside behind beyond near under above below over opposite between around inside".split()}
+_NONE = ("no", "without", "zero", "nor", "0")
+_BREAKS = {"with", "then", "but", *_NONE}  # adjectives do not reach over them
+_QUIET = {*"with and or but the of then there is are has have its it that which also plus through from into leads leading lead "
+          "another opens onto where stands stand side sides".split()}  # fmt: skip
 _THINGS = {*KINDS, "door", "window", "stairs"}
-MOST_EACH = 24
-
-
-@dataclass
-class _ItemText:
-    """A thing in the text: its kind, how many, its look, its size relative to the usual, and where."""
-
-    label: str
-    count: int
-    look: str
-    scale: tuple[float, float, float]
-    side: str = ""
+_SIDELESS = {
+    "door": ("middle", "corner"),
+    "window": ("middle", "corner"),
+    "stairs": ("east", "west", "middle", "corner"),
+}
+_NOUNS = {*ROOMS, *_THINGS, *_SURFACES}
+MOST_ROOMS = 12
+MOST_COUNT = 10_000
 
 
 @dataclass
 class _RoomText:
     kind: str
-    scale: tuple[float, float, float]
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     looks: dict[str, str] = field(default_factory=dict)
-    things: list[_ItemText] = field(default_factory=list)
+    things: list[FurnitureRequest] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -78,20 +80,22 @@ class ParsedText:
 
     layout: RoomLayout
     document: dict[str, Any]  # the same, as layout.json has it
-    unknown: tuple[str, ...]  # words that were not understood
+    unknown: tuple[str, ...]  # words that were not understood, or have no effect
     left_out: tuple[str, ...]  # things for which there was no place
+    text: str = ""
 
 
 def parse_text(text: str, seed: int = 0) -> ParsedText:
     """The layout that a text describes; ContractError if none of its words names a room or a thing."""
-    rooms, unknown = _parsed(text)
-    if not rooms:
+    reader = _Reader(text)
+    if not reader.rooms:
         raise ContractError(
             f"nothing in '{text:.80}' names a room or a thing; try \"a long room with two pillars and a red door\". "
             f"Rooms: {', '.join(ROOMS)}. Things: {', '.join(sorted(_THINGS))}."
         )
+    name = " ".join(text.split())
     layout: dict[str, Any] = {
-        "name": "place",
+        "name": name if len(name) <= 60 else f"{name[:57].rstrip()}...",
         "seed": seed,
         "rooms": [],
         "doors": [],
@@ -100,9 +104,10 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
         "things": [],
     }
     x, names = 0.0, []
-    for room in rooms:
+    for room in reader.rooms:
         about = {**ROOMS[room.kind], **room.looks}
-        size = [round(max(a * b, 1.6), 2) for a, b in zip(about.pop("size"), room.scale)]
+        least = (1.6, 1.6, 2.3)  # a door must fit
+        size = [round(max(a * b, c), 2) for a, b, c in zip(about.pop("size"), room.scale, least)]
         if any(one.label in ("stairs", "platform") for one in room.things):
             size[2] = max(size[2], 3.2)
         names.append(room.kind if room.kind not in names else f"{room.kind} {len(names) + 1}")
@@ -111,57 +116,188 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
         )
         x += size[0] + 0.12
     left_out: list[str] = []
-    for at, room in enumerate(rooms):
-        following = at + 1 < len(rooms)
-        left_out += furnish_room(layout, at, room.things, following, seed)
-    return ParsedText(read_layout(layout), layout, tuple(unknown), tuple(left_out))
+    for at, room in enumerate(reader.rooms):
+        left_out += furnish_room(layout, at, room.things, seed)
+    unknown = tuple(dict.fromkeys(reader.unknown))
+    return ParsedText(read_layout(layout), layout, unknown, tuple(left_out), name)
 
 
-def _parsed(text: str) -> tuple[list[_RoomText], list[str]]:
-    """The rooms with their things, and the words that were not understood."""
-    rooms: list[_RoomText] = []
-    unknown: list[str] = []
-    words: list[str] = re.findall(r"[a-z0-9#]+", text.lower())[:400]
-    count, scale, look, placed, definite, last = 1, (1.0, 1.0, 1.0), [], False, False, None
-    for at, word in enumerate(words):
-        noun, following = _noun(word), _noun(words[at + 1]) if at + 1 < len(words) else ""
-        compound = following in ROOMS and (word in ("living", "dining", "sitting"))
-        if word in SIDES and last is not None and placed:
-            last.side, placed = SIDES[word], False
-        elif word in NUMBERS or word.isdigit():
-            count = min(NUMBERS.get(word) or int(word), MOST_EACH)
+class _Reader:
+    """Reads a text word by word: `rooms` with their things, and the words without effect, `unknown`."""
+
+    def __init__(self, text: str):
+        self.rooms: list[_RoomText] = []
+        self.unknown: list[str] = []
+        self.here: list[_RoomText] = []  # the rooms that get what follows
+        self.last: FurnitureRequest | None = None
+        self.side = ""  # given before its thing: "in the corner a lamp"
+        self.implied = False  # whether no word named the first room yet
+        self.none = self.definite = self.placed = self.strange = False
+        self.relation = ""  # the last preposition
+        self._forget()
+        self.words: list[str] = re.findall(r"[a-z0-9#]+|[,;.:]", text.lower())[:400]
+        for at, word in enumerate(self.words):
+            self.at = at
+            self._read(word)
+            self.definite = word == "the" or (self.definite and word not in _QUIET and _noun(word) not in _NOUNS)
+        self._drop()
+
+    def _forget(self) -> None:
+        """Begins a new phrase."""
+        self.count: int | None = None
+        self.scale, self.look = (1.0, 1.0, 1.0), []
+        self.waiting: list[str] = []  # sizes, looks and numbers before their noun
+        self.strange = False  # whether an unknown word came after them
+
+    def _drop(self) -> None:
+        """Reports the words that wait for a noun, because none came."""
+        self.unknown += self.waiting
+        if self.side:
+            self.unknown.append(self.side)
+        self.side = ""
+        self._forget()
+
+    def _read(self, word: str) -> None:
+        noun, following = _noun(word), self._word(1)
+        if word in _BREAKS or (self.strange and word in ("and", ",", ";", ".", "a", "an")):
+            self._drop()
+        if word in _NONE:
+            self.none = True
+        elif word in SIDES and self._is_side(word):
+            self._set_side(word)
+        elif word in NUMBERS or word in GROUPS or word.isdigit():
+            self._number(word)
         elif noun in ROOMS:
-            if not (
-                rooms and (definite or placed) and count == 1 and not look
-            ):  # "in the middle of the room" is no new one
-                rooms.append(_RoomText(noun, scale, {"walls": " ".join(look)} if look else {}))
-                last = None
-            count, scale, look, placed = 1, (1.0, 1.0, 1.0), [], False
-        elif noun in _SURFACES and (look or not placed):
-            rooms = rooms or [_RoomText("room", (1.0, 1.0, 1.0))]
-            rooms[-1].looks |= {noun: " ".join(look)} if look else {}
-            count, scale, look = 1, (1.0, 1.0, 1.0), []
-        elif noun in _THINGS and not (noun == "rug" and following in _SURFACES):
-            rooms = rooms or [_RoomText("room", (1.0, 1.0, 1.0))]
-            last = _ItemText(noun, count, " ".join(look), scale)
-            rooms[-1].things.append(last)
-            count, scale, look, placed = 1, (1.0, 1.0, 1.0), [], False
-        elif word in SIZES:
-            scale = (scale[0] * SIZES[word][0], scale[1] * SIZES[word][1], scale[2] * SIZES[word][2])
-        elif word in looks.WORDS:
-            look.append(word)
-        elif word in SIDES or compound or word in _QUIET or noun in _SURFACES:
-            placed = placed or word in _PLACES
+            self._room(noun, word)
+        elif noun in _SURFACES:
+            self._surface(noun)
+        elif noun in _THINGS and not (noun == "rug" and _noun(following) in _SURFACES):
+            self._thing(noun, word)
+        elif word in SIZES or (word == "very" and following in SIZES):
+            more = SIZES[following if word == "very" else word]
+            self.scale = (self.scale[0] * more[0], self.scale[1] * more[1], self.scale[2] * more[2])
+            self.waiting.append(word)
+        elif word in looks.WORDS or re.fullmatch("#[0-9a-f]{6}", word):
+            self.look.append(word)
+            self.waiting.append(word)
+        elif word in _RELATIONS:
+            self.relation, self.placed = word, self.placed or word in _PLACES
+        elif (
+            word not in _QUIET
+            and not (word in ("living", "dining", "sitting") and following in ROOMS)
+            and word.isalnum()
+        ):
+            self.unknown.append(word)
+            self.strange = bool(self.waiting)
+
+    def _word(self, ahead: int) -> str:
+        return self.words[self.at + ahead] if 0 <= self.at + ahead < len(self.words) else ""
+
+    def _is_side(self, word: str) -> bool:
+        """Whether it says where a thing is, and is no preposition: not "near the door", nor "in front of the door"."""
+        return not (word == "near" and not self.placed or word == "front" and self._word(1) == "of")
+
+    def _set_side(self, word: str) -> None:
+        side = SIDES[word]
+        if not self.placed:
+            self.unknown.append(word)
+        elif self.last is None:
+            self.side = word
+        elif side in _SIDELESS.get(self.last.label, ()):
+            self.unknown.append(word)
         else:
-            unknown.append(word)
-        definite = word == "the" or definite and word not in (*_QUIET, *_THINGS)
-    return rooms, list(dict.fromkeys(unknown))
+            self.last.side = side
+        self.placed, self.relation = False, ""
+
+    def _number(self, word: str) -> None:
+        if word in GROUPS:
+            self.count = (self.count or 1) * GROUPS[word]
+        else:
+            self._drop() if self.waiting else None
+            self.count = min(NUMBERS[word] if word in NUMBERS else int(word[:9]), MOST_COUNT)
+            self.none = self.none and word in ("a", "an", "single", "some")
+        if word not in ("a", "an"):
+            self.waiting.append(word)
+
+    def _taken(self, noun: str, word: str) -> int:
+        """How many of a noun there are to be; its phrase ends here."""
+        plural = word not in (noun, "stair", "staircase") and word.endswith("s")
+        count = self.count if self.count is not None else PLURALS.get(noun, 3) if plural else 1
+        count = 0 if self.none else count
+        self.none = self.none and self._word(1) in ("or", "nor")
+        self.placed, self.relation = False, ""
+        self._forget()
+        return count
+
+    def _room(self, noun: str, word: str) -> None:
+        same = [room for room in self.rooms if room.kind == noun]
+        if self.rooms and (self.definite or self.placed) and (same or noun == "room") and not self.waiting:
+            self.here = same[-1:] or self.here  # "in the middle of the room" is no new one
+            self._taken(noun, "")
+            return
+        scale, look, implied = self.scale, " ".join(self.look), self.relation == "in" and self.implied
+        count = self._taken(noun, word)
+        if count == 1 and implied:  # "two pillars in a hall"
+            self.rooms[0].kind, self.rooms[0].scale, self.implied = noun, scale, False
+            self.rooms[0].looks = {**({"walls": look} if look else {}), **self.rooms[0].looks}
+            return
+        if count > MOST_ROOMS - len(self.rooms):
+            self.unknown.append(f"{count} {noun}s")
+            count = MOST_ROOMS - len(self.rooms)
+        if count:
+            self.here = [_RoomText(noun, scale, {"walls": look} if look else {}) for _ in range(count)]
+            self.rooms += self.here
+            self.last, self.implied = None, False
+
+    def _surface(self, noun: str) -> None:
+        if self.placed and not self.look and not self.none:  # "at the far wall"
+            self.unknown += self.waiting
+            self._forget()
+            return
+        self._begin()
+        (x, y, z), look = self.scale, " ".join(self.look)
+        used = {"floor": (x, y, 1.0), "ceiling": (1.0, 1.0, z), "walls": (x, y, z)}[noun]
+        if self.none:
+            look = "sky" if noun == "ceiling" else look
+            self.unknown += [] if noun == "ceiling" else [f"no {noun}"]
+        self.unknown += [one for one in self.waiting if one in SIZES and used == (1.0, 1.0, 1.0)]
+        self.unknown += [one for one in self.waiting if (one in NUMBERS or one.isdigit()) and self.count != 4]
+        for room in self.here:
+            room.scale = (room.scale[0] * used[0], room.scale[1] * used[1], room.scale[2] * used[2])
+            room.looks |= {noun: look} if look else {}
+        self._taken(noun, "")
+
+    def _thing(self, noun: str, word: str) -> None:
+        self._begin()
+        related = self.relation if self.definite or self.last is not None and self.relation not in ("", "to") else ""
+        self.unknown += [related] if related else []
+        if self.definite and related and not self.waiting and any(one.label == noun for one in self.here[-1].things):
+            self._taken(noun, "")  # "a lamp beside the table" is no second table
+            return
+        flat = self.scale[:2] == (1.0, 1.0)
+        if noun == "stairs" or (noun in ("pillar", "rug") and flat):  # pillars reach the ceiling
+            self.unknown += [one for one in self.waiting if one in SIZES]
+        scale, look = self.scale, " ".join(self.look)
+        count = self._taken(noun, word)
+        side, self.side = SIDES.get(self.side, ""), ""
+        for room in self.here:
+            self.last = FurnitureRequest(noun, count, look, scale, side)
+            if count:
+                room.things.append(self.last)
+            else:
+                room.things = [one for one in room.things if one.label != noun]
+
+    def _begin(self) -> None:
+        """A room, if the text names none before its things."""
+        if not self.rooms:
+            self.implied, self.here = True, [_RoomText("room")]
+            self.rooms += self.here
 
 
 def _noun(word: str) -> str:
     """The word in the singular, by its usual name."""
     for one in (word, word.removesuffix("s"), word.removesuffix("es"), word.removesuffix("ies") + "y"):
         one = _SAME.get(one, one)
-        if one in ROOMS or one in _THINGS or one in _SURFACES:
+        if one in _NOUNS:
             return one
     return word
