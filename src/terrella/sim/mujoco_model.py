@@ -18,7 +18,6 @@ from ..core.errors import TerrellaError
 SERVO_HZ, SERVO_DAMPING = 3.0, 1.0  # natural frequency and damping ratio of added servos
 FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
-_REACH = {True: 1.0, False: float(np.pi)}  # range of an added servo without joint limits: slides in m, hinges in rad
 
 
 def read(path: str | Path) -> mujoco.MjSpec:
@@ -96,20 +95,62 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
 
 
 def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Adds a position servo to each hinge and slide, with a stiffness for its inertia."""
+    """Adds a position servo to each hinge and slide that no other joint drives, with a stiffness for the inertia that it moves."""
+    groups = coupled_joints(model)
+    driven = {joint for group in groups for joint in list(group)[1:]} | set(_held_joints(model, groups))
+    moves = {next(iter(group)): group for group in groups}
     for joint in spec.joints:
-        if joint.type in (FREE, BALL):
+        at = model.joint(joint.name).id if joint.type not in (FREE, BALL) else -1
+        if at < 0 or at in driven:
             continue
-        at = model.joint(joint.name).id
-        inertia = max(float(model.dof_M0[model.jnt_dofadr[at]]), 1e-6)
+        inertias = model.dof_M0[model.jnt_dofadr]
+        inertia = sum(ratio**2 * float(inertias[one]) for one, (ratio, _) in moves.get(at, {at: (1.0, 0.0)}).items())
+        inertia = max(inertia, 1e-6)
         stiff = inertia * (2 * np.pi * SERVO_HZ) ** 2
-        servo = spec.add_actuator(
-            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, ctrllimited=True
-        )
+        servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_position(stiff, kv=2 * SERVO_DAMPING * float(np.sqrt(stiff * inertia)))
-        reach = _REACH[joint.type == SLIDE]
-        limited = bool(model.jnt_limited[at])
-        servo.ctrlrange = model.jnt_range[at] if limited else [-reach, reach]
+        servo.ctrllimited = bool(model.jnt_limited[at])
+        if servo.ctrllimited:
+            servo.ctrlrange = model.jnt_range[at]
+
+
+def coupled_joints(model: mujoco.MjModel) -> list[dict[int, tuple[float, float]]]:
+    """Groups of joints that equality constraints move together (URDF's mimic), in chains too: joint -> (ratio, offset) of its
+    displacement from the reference pose to that of the first, which drives: one that follows no other, where there is one."""
+    links: dict[int, list[tuple[int, float, float]]] = {}
+    followers = set()
+    for one, other, data in _joint_equalities(model):
+        if other >= 0 and data[1]:  # one = offset + ratio other, to first order
+            followers.add(one)
+            links.setdefault(other, []).append((one, data[1], data[0]))
+            links.setdefault(one, []).append((other, 1 / data[1], -data[0] / data[1]))
+    groups: list[dict[int, tuple[float, float]]] = []
+    for first in sorted(links, key=lambda joint: (joint in followers, joint)):
+        if any(first in group for group in groups):
+            continue
+        group, waiting = {first: (1.0, 0.0)}, [first]
+        while waiting:
+            joint = waiting.pop(0)
+            for other, ratio, offset in links[joint]:
+                if other not in group:
+                    group[other] = ratio * group[joint][0], offset + ratio * group[joint][1]
+                    waiting.append(other)
+        groups.append(group)
+    return groups
+
+
+def _joint_equalities(model: mujoco.MjModel) -> list[tuple[int, int, list[float]]]:
+    """Active equality constraints of joints: the joint, the one that it follows (-1: none), and the polynomial."""
+    active = (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)
+    return [
+        (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), model.eq_data[k].tolist()) for k in np.flatnonzero(active)
+    ]
+
+
+def _held_joints(model: mujoco.MjModel, groups: list[dict[int, tuple[float, float]]]) -> list[int]:
+    """Joints that a constraint holds at a constant, with those that are coupled to them."""
+    held = {one for one, other, data in _joint_equalities(model) if other < 0 or not any(data[1:5])}
+    return [*held, *(joint for group in groups if held & group.keys() for joint in group)]
 
 
 def _add_camera(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

@@ -73,15 +73,18 @@ def _one_mass(at: int) -> Parameter:
     return Parameter(1.0, 0.2, 5.0, "x", "mass and inertia of this body", change)
 
 
-def _camera(field: str, axis: int | None, reach: float, unit: str, what: str) -> Parameter:
+def _camera(axis: int, what: str) -> Parameter:
     def change(model: Model, file: Model, value: float) -> None:
-        if axis is None:
-            getattr(model, field)[:] = value * getattr(file, field)
-        else:
-            getattr(model, field)[:, axis] = getattr(file, field)[:, axis] + value
+        model.cam_pos[:, axis] = file.cam_pos[:, axis] + value
 
-    nominal, low, high = (1.0, 0.3, 1.8) if axis is None else (0.0, -reach, reach)
-    return Parameter(nominal, low, high, unit, what, change, True)
+    return Parameter(0.0, -1.0, 1.0, "m", what, change, True)
+
+
+def _field_of_view(model: Model, file: Model, value: float) -> None:
+    """A factor on the vertical angle, which MuJoCo draws with, or with the focal length of cameras that have a sensor."""
+    model.cam_fovy[:] = value * file.cam_fovy
+    half = np.radians(file.cam_fovy) / 2
+    model.cam_intrinsic[:, :2] = file.cam_intrinsic[:, :2] * (np.tan(half) / np.tan(value * half))[:, None]
 
 
 def _light(model: Model, file: Model, value: float) -> None:
@@ -138,7 +141,9 @@ def _scene_parameter(high: float, what: str) -> Parameter:
     return Parameter(0.0, 0.0, high, "", what, lambda model, file, value: None, True)
 
 
-SEEN = ("cam_pos", "cam_quat", "cam_fovy", "light_pos", "light_dir", "light_diffuse", "geom_rgba", "mat_rgba")
+SEEN = (
+    "cam_pos", "cam_quat", "cam_fovy", "cam_intrinsic", "light_pos", "light_dir", "light_diffuse", "geom_rgba", "mat_rgba",
+)  # fmt: skip
 TEXTURES = _scene_parameter(1.0, "share of the surfaces with a random texture; the value's bits seed the choice")
 COLOURS = _scene_parameter(1.0, "blend of each surface's colour towards a random one; the value's bits seed the choice")
 DISTRACTORS = _scene_parameter(20.0, "number of added balls and boxes; the value's bits seed their places and colours")
@@ -158,10 +163,10 @@ def parameters_of(model: Model) -> Mapping[str, Parameter]:
         "spring": Parameter(0.0, 0.0, 100.0, "N m/rad or N/m", "springs in the joints towards 0, added to the file's", _stiff),
         "gain": Parameter(1.0, 0.3, 2.0, "x", "gain of the servos, or force of the motors", _gains),
         "strength": _scaled("actuator_forcerange", low=0.1, high=2.0, what="limit of the actuators' forces"),
-        "camera.x": _camera("cam_pos", 0, 1.0, "m", "moved along its body's x"),
-        "camera.y": _camera("cam_pos", 1, 1.0, "m", "moved along its body's y"),
-        "camera.z": _camera("cam_pos", 2, 1.0, "m", "moved along its body's z"),
-        "camera.fov": _camera("cam_fovy", None, 0.0, "x", "field of view"),
+        "camera.x": _camera(0, "moved along its body's x"),
+        "camera.y": _camera(1, "moved along its body's y"),
+        "camera.z": _camera(2, "moved along its body's z"),
+        "camera.fov": Parameter(1.0, 0.3, 1.8, "x", "field of view", _field_of_view, True),
         "light": Parameter(1.0, 0.0, 3.0, "x", "brightness of the lights", _light, True),
         "camera.pitch": _turned_camera(0), "camera.yaw": _turned_camera(1), "camera.roll": _turned_camera(2),
         "light.turn": _turned_lights(2, float(np.pi), "rotation of the lights about the vertical"),

@@ -25,10 +25,24 @@ MARKER_RGBA, MARKER_M = (1.0, 0.25, 0.2, 1.0), 0.03  # the marker's colour and r
 HINT = "set MUJOCO_GL=egl or MUJOCO_GL=osmesa before Python starts, and install libegl1 or libosmesa6"
 
 
-def lens(model: mujoco.MjModel, name: str, size: tuple[int, int], pose: str) -> Camera:
-    """The pinhole intrinsics of a camera of the model, for pictures of `size` (height, width)."""
-    focal = 0.5 / math.tan(math.radians(float(model.camera(name).fovy[0])) / 2)
-    return Camera((focal * size[0] / size[1], focal, 0.5, 0.5), size, pose)
+def lens(model: mujoco.MjModel, name: str, size: tuple[int, int], pose: str) -> Camera | None:
+    """The intrinsics with which MuJoCo draws pictures of `size` (height, width) from a camera of the model: by its field of view,
+    or by its focal length and principal point on a sensor, which fills the picture. None for orthographic cameras, and where the
+    optical axis lies left of the picture or above it."""
+    data, scene, camera = mujoco.MjData(model), mujoco.MjvScene(model, 1), mujoco.MjvCamera()
+    camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, model.camera(name).id
+    for derive in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight):
+        derive(model, data)
+    mujoco.mjv_updateCamera(model, data, camera, scene)
+    view = scene.camera[0]
+    if view.orthographic:
+        return None
+    if not view.frustum_width:
+        focal = 0.5 / math.tan(math.radians(float(model.camera(name).fovy[0])) / 2)
+        return Camera((focal * size[0] / size[1], focal, 0.5, 0.5), size, pose)
+    wide, tall, near = 2 * view.frustum_width, view.frustum_top - view.frustum_bottom, view.frustum_near
+    across, down = 0.5 - view.frustum_center / wide, view.frustum_top / tall
+    return Camera((near / wide, near / tall, across, down), size, pose) if min(across, down) > 0 else None
 
 
 class MujocoRenderer:

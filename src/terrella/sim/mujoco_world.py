@@ -24,8 +24,9 @@ from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
 from ..core.state import State
 from .mujoco_appearance import patterned
+from .mujoco_controls import ControlLimits, control_mode, control_name, control_unit, controls_of
 from .mujoco_lidar import SITE, Lidar
-from .mujoco_model import BALL, FREE, SLIDE, bare, compiled, complete, mujoco, read
+from .mujoco_model import BALL, FREE, bare, compiled, complete, coupled_joints, mujoco, read
 from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_renderer import MujocoRenderer, lens
 from .mujoco_robots import Robot, robot_of
@@ -99,9 +100,10 @@ class MujocoWorld:
         self._threads, self._device = config.threads or _cores(), config.device
         self._dumped = 0
         self._dumps = Path(config.dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}")
-        self._home = _home(self.file, robot)
+        home = _home(self.file, robot)
+        self._controls = controls_of(self.file, home)
         self.task: RobotTask = config.task or (robot.task if robot else task_of(spec, label))
-        self.layout = _layout(self.file, self._home, self._steps)
+        self.layout = _layout(self.file, home, self._controls, self._steps)
         self._cameras = _cameras(self._seen, config.cameras)
         shown = (("depth", config.depth), ("segmentation", config.segmentation))
         self._kinds = ("rgb", *(kind for kind, wanted in shown if wanted))
@@ -173,6 +175,7 @@ class MujocoWorld:
         qpos, qvel = layout.home.repeat(batch, 1), torch.zeros(batch, self.file.nv, dtype=torch.float64)
         kept = self.task.initialise(layout, seeds, qpos, qvel)
         physics[:, layout.qpos], physics[:, layout.qvel] = qpos, qvel
+        physics[:, layout.qvel.stop : layout.qvel.stop + self.file.na] = torch.from_numpy(self._controls.act)
         ctrl = layout.rest.repeat(batch, 1)
         nominal = torch.tensor([self.parameters[name].nominal for name in self.varied], dtype=torch.float64)
         values = nominal.repeat(batch, 1)
@@ -318,7 +321,13 @@ class MujocoWorld:
         for end in suffix.values():
             channels |= {f"{kind}{end}": spaces_of[kind] for kind in self._kinds} | {f"pose{end}": POSE}
             units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
-        cameras = {f"rgb{end}": lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
+        lenses = {camera: lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
+        cameras = {f"rgb{suffix[camera]}": one for camera, one in lenses.items() if one is not None}
+        notes = [
+            f"camera {camera} is no pinhole: it has no intrinsics" for camera, one in lenses.items() if one is None
+        ]
+        if chosen := self._controls.chosen:
+            notes.append(f"limits of controls that the file does not state: {', '.join(chosen)}")
         return Spec(
             name=self.name,
             **self._action_fields(),
@@ -331,7 +340,7 @@ class MujocoWorld:
             max_episode_steps=self._limit,
             card={
                 "what": self._what, "kind": "simulator", "physics": _physics_text(model, self._steps), "varied": list(self.varied),
-                "together": True,
+                "together": True, **({"notes": notes} if notes else {}),
             },
         )  # fmt: skip
 
@@ -350,9 +359,9 @@ class MujocoWorld:
         low, high = (limit.numpy().astype(np.float32) for limit in (layout.low, layout.high))
         return {
             "action": spaces.Box(low, high),
-            "action_names": tuple(model.actuator(at).name or f"actuator {at + 1}" for at in range(model.nu)),
-            "action_units": self._units or tuple(_unit(model, at) for at in range(model.nu)),
-            "action_mode": _mode(model),
+            "action_names": tuple(control_name(model, at) for at in range(model.nu)),
+            "action_units": self._units or tuple(control_unit(model, at) for at in range(model.nu)),
+            "action_mode": control_mode(model),
             "keys": self._keys,
             "idle": tuple(layout.rest.float().tolist()),
         }
@@ -363,28 +372,22 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _home(model: mujoco.MjModel, robot: Robot | None) -> tuple[np.ndarray, np.ndarray]:
-    """qpos [nq] and ctrl [nu] at rest: the robot's pose, the file's first keyframe, or the reference pose."""
-    qpos, ctrl = (model.key_qpos[0], model.key_ctrl[0]) if model.nkey else (model.qpos0, np.zeros(model.nu))
-    qpos, ctrl = qpos.copy(), ctrl.copy()
+def _home(model: mujoco.MjModel, robot: Robot | None) -> np.ndarray:
+    """qpos [nq] at rest: the robot's pose, the file's first keyframe, or the reference pose with coupled joints in their places."""
+    qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
     if robot is not None and robot.pose:
         for at in range(model.njnt):
             if model.jnt_type[at] not in (int(FREE), int(BALL)):
                 qpos[model.jnt_qposadr[at]] = robot.rest(model.joint(at).name)
+    elif not model.nkey:
+        for joint, (_, offset) in ((joint, one) for group in coupled_joints(model) for joint, one in group.items()):
+            qpos[model.jnt_qposadr[joint]] += offset
     if robot is not None and robot.height is not None:
         qpos[2] = robot.height
-    servo = (model.actuator_biasprm[:, 1] < 0) & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
-    for at in np.flatnonzero(servo):
-        if not model.nkey:
-            ctrl[at] = qpos[model.jnt_qposadr[model.actuator_trnid[at, 0]]]
-    return qpos, ctrl
+    return qpos
 
 
-def _layout(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: int) -> RobotLayout:
-    limited = model.actuator_ctrllimited.astype(bool)
-    low = np.where(limited, model.actuator_ctrlrange[:, 0], -1.0)
-    high = np.where(limited, model.actuator_ctrlrange[:, 1], 1.0)
-    rest = np.clip(home[1], low, high)
+def _layout(model: mujoco.MjModel, home: np.ndarray, controls: ControlLimits, steps: int) -> RobotLayout:
     ends = 1 + model.nq, 1 + model.nq + model.nv
     sensors = {
         model.sensor(at).name or f"sensor{at + 1}": slice(
@@ -394,8 +397,8 @@ def _layout(model: mujoco.MjModel, home: tuple[np.ndarray, np.ndarray], steps: i
     }
     own = (model.jnt_type != int(FREE)) & (model.jnt_type != int(BALL))
     hinges = torch.from_numpy(model.jnt_qposadr[own]).long(), torch.from_numpy(model.jnt_dofadr[own]).long()
-    plain = (torch.from_numpy(np.asarray(part, np.float64)) for part in (home[0], rest, low, high))
-    at_home, at_rest, lowest, highest = plain
+    numbers_of = (home, controls.rest, controls.low, controls.high)
+    at_home, at_rest, lowest, highest = (torch.from_numpy(np.asarray(part, np.float64)) for part in numbers_of)
     step_s = steps * float(model.opt.timestep)
     return RobotLayout(slice(1, ends[0]), slice(*ends), hinges, at_home, at_rest, lowest, highest, sensors, step_s)
 
@@ -406,27 +409,6 @@ def _cameras(model: mujoco.MjModel, wanted: Sequence[str] | None) -> list[str]:
     if unknown:
         raise TerrellaError(f"there is no camera {', '.join(unknown)}; there are {', '.join(known)}.")
     return known[:1] if wanted is None else list(wanted)
-
-
-def _unit(model: mujoco.MjModel, at: int) -> str:
-    """The unit of a control: rad, rad/s or N m for hinges; m, m/s or N for slides; else ""."""
-    joint = model.actuator_trnid[at, 0]
-    if model.actuator_trntype[at] != int(mujoco.mjtTrn.mjTRN_JOINT):
-        return ""
-    slides = model.jnt_type[joint] == int(SLIDE)
-    position, velocity = model.actuator_biasprm[at, 1] < 0, model.actuator_biasprm[at, 2] < 0
-    if position or velocity:
-        return ("m" if slides else "rad") + ("" if position else "/s")
-    gear = abs(float(model.actuator_gear[at, 0] * model.actuator_gainprm[at, 0]))
-    force = "N" if slides else "N m"
-    return force if gear == 1 else f"{gear:g} {force}"
-
-
-def _mode(model: mujoco.MjModel) -> str:
-    servo = model.actuator_biasprm[:, 1] < 0
-    if model.nu and servo.all():
-        return "position"
-    return "axes" if servo.any() or (model.actuator_biasprm[:, 2] < 0).any() else "torque"
 
 
 def _physics_text(model: mujoco.MjModel, steps: int) -> str:
