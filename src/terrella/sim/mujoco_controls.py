@@ -43,15 +43,15 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
     hold = np.array([_control_at(model, at, float(data.actuator_length[at])) for at in range(model.nu)]).reshape(-1)
     rest = model.key_ctrl[0].copy() if model.nkey and model.key_ctrl[0].any() else np.where(servo, hold, 0.0)
     limits, chosen = model.actuator_ctrlrange.copy(), []
-    for at in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)):
+    for at in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)).tolist():
         limits[at], why = _limits(model, data, at, kinds[at])
-        limits[at] = min(limits[at, 0], rest[at]), max(limits[at, 1], rest[at])
-        low, high = limits[at]
+        low, high = limits[at] = min(limits[at, 0], rest[at]), max(limits[at, 1], rest[at])
         chosen.append(
             f"{control_name(model, at)} {low:.4g} to {high:.4g} {control_unit(model, at)}".rstrip() + f" ({why})"
         )
-    rest = np.clip(rest, *limits.T)
-    return ControlLimits(*limits.T, rest, _activations(model, kinds, rest, hold), tuple(chosen))
+    low, high = limits[:, 0], limits[:, 1]
+    rest = np.clip(rest, low, high)
+    return ControlLimits(low, high, rest, _activations(model, kinds, rest, hold), tuple(chosen))
 
 
 def kind_of_control(model: mujoco.MjModel, at: int) -> str:
@@ -138,7 +138,7 @@ def _lengths(model: mujoco.MjModel, data: mujoco.MjData, at: int) -> tuple[tuple
         ends, own = _tendon_range(model, target)
     else:  # sites and balls: a direction, and turns about it
         moves = kind == _SITE and gear[:3].any()
-        reach = SLIDE_M * np.linalg.norm(gear[:3]) if moves else TURN_RAD * max(np.linalg.norm(gear), 1e-9)
+        reach = SLIDE_M * float(np.linalg.norm(gear[:3])) if moves else TURN_RAD * float(np.linalg.norm(gear))
         return (float(data.actuator_length[at]) - reach, float(data.actuator_length[at]) + reach), False
     low, high = sorted(float(gear[0]) * end for end in ends)
     return (low, high), own
