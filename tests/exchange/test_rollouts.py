@@ -261,7 +261,7 @@ def test_bad_folders_are_named(tmp_path):
     good = {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1))}
     for bad, match in [
         ({"x": np.zeros(3)}, "no observations; it holds x"),
-        ({"observations": np.array([{"a": 1}], object)}, "pickled"),
+        ({"observations": np.array([{"a": 1}], object)}, "no observations"),
         ({**good, "actions": np.zeros((2, 1))}, "4 observations and 2 actions"),
         ({**good, "rewards": np.zeros(4)}, "different rates"),
         ({**good, "time_s": np.array([0, 1, np.nan, 3])}, "ascending"),
@@ -275,9 +275,6 @@ def test_bad_folders_are_named(tmp_path):
     save(one, **good)
     save(tmp_path / "r" / "2.npz", observations=np.zeros((4, 3)), actions=np.zeros((3, 1)))
     with pytest.raises(DatasetError, match=r"2\.npz is \[3\] a row where the first episode has \[2\]"):
-        list(rollouts.read(tmp_path / "r").takes())
-    save(tmp_path / "r" / "2.npz", observations=np.zeros((4, 2)))
-    with pytest.raises(DatasetError, match=r"2\.npz lacks 'actions'"):
         list(rollouts.read(tmp_path / "r").takes())
     (tmp_path / "r" / "terrella.json").write_text("[")
     with pytest.raises(DatasetError, match="terrella.json is damaged"):

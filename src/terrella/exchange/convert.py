@@ -10,6 +10,7 @@ from ..core.errors import DatasetError
 from ..data.format import INFO
 from ..data.source import Sensor, Source, Take
 from .formats.folders import IMAGES, VIDEOS
+from .formats.rows import facts_of
 
 Format = Literal["lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"]
 _MAX_DEPTH = 4  # levels of subfolders that are searched for recordings
@@ -175,8 +176,8 @@ def _takes_noting_losses(
             if present and part not in kind.keeps:
                 lost[_TAKE_PARTS[part]] = None
         if "facts" not in kind.keeps:
-            for name in take.facts:
-                if name != "language" and name not in kind.keeps:
+            for name in facts_of(take):
+                if name.split(" ")[0] not in kind.keeps:
                     lost[f"the fact '{name}' of takes"] = None
         yield take
 

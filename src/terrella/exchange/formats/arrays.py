@@ -3,7 +3,7 @@ and says what the first key of a place means (`names`); sensors, readings and th
 
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -41,6 +41,11 @@ class Array:
     def is_numeric(self) -> bool:
         return self.dtype.kind in "biuf" and self.dtype.itemsize <= 8 and len(self.shape) > 0
 
+    @property
+    def is_text(self) -> bool:
+        """Whether it holds texts: a numpy type of them, or that of h5py."""
+        return self.dtype.kind in "US" or (self.dtype.metadata or {}).get("vlen") is str
+
 
 def jpeg_rows(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes], where: str) -> Array:
     """An array with one JPEG file per row; reading a damaged one, or one of another size, is a DatasetError."""
@@ -59,6 +64,25 @@ def jpeg_rows(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes]
         return np.stack([decode(i) for i in range(start, stop)])
 
     return Array((count, *shape), np.dtype(np.uint8), read)
+
+
+def fields(place: Place, array: Array) -> Iterator[tuple[Place, Array]]:
+    """The array, or one array for each field of its records (a structured dtype)."""
+    for name in array.dtype.names or ():
+        base, inner = array.dtype[name].subdtype or (array.dtype[name], ())
+
+        def read(start: int, stop: int, name=name) -> np.ndarray:
+            return array.read(start, stop)[name]
+
+        yield from fields((*place, name), Array((*array.shape, *inner), base, read))
+    if not array.dtype.names:
+        yield place, array
+
+
+def texts(array: Array) -> list[str]:
+    """The texts of all rows of an array, or of one without rows."""
+    stored = np.atleast_1d(array.read(0, array.shape[0] if array.shape else 0))
+    return [it.decode("utf-8", "replace") if isinstance(it, bytes) else str(it) for it in stored.tolist()]
 
 
 def joined(place: Place) -> str:
@@ -106,18 +130,31 @@ def columns(
     return sensors, notes
 
 
+def union(episodes: Iterable[Mapping[Place, Array]]) -> dict[Place, Array]:
+    """The arrays that any episode has, of a dtype that holds the numbers of all."""
+    arrays: dict[Place, Array] = {}
+    for episode in episodes:
+        for place, array in episode.items():
+            known = arrays.setdefault(place, array)
+            if known.is_numeric < array.is_numeric:
+                arrays[place] = array
+            elif known.is_numeric and array.is_numeric and known.dtype != array.dtype:
+                arrays[place] = replace(known, dtype=np.promote_types(known.dtype, array.dtype))
+    return arrays
+
+
 def readings(
     arrays: Mapping[Place, Array], sensors: Mapping[Place, Sensor], time_s: np.ndarray, where: str
 ) -> dict[str, Readings]:
-    """The readings of one take, row i at time_s[i]. Pictures are read lazily.
+    """The readings of one take, row i at time_s[i]; arrays that it lacks have none. Pictures are read lazily.
 
-    DatasetError where an array is missing, has another shape than its sensor, or more rows than there are times.
+    DatasetError where an array has another shape than its sensor, or more rows than there are times.
     """
     result = {}
     for place, sensor in sensors.items():
         what, want = f"'{spelled(place)}' in {where}", rows.stored_shape(sensor)
         if place not in arrays:
-            raise DatasetError(f"{where} lacks '{spelled(place)}', an array of numbers; mend it, or drop it.")
+            continue
         array = arrays[place]
         if not array.is_numeric:
             raise DatasetError(f"{what} is not an array of numbers with a row for each step; restore it from a copy.")

@@ -1,7 +1,7 @@
 """Reads the Counter-Strike deathmatch recordings that DIAMOND was trained on (Pearce and Zhu, arXiv:2104.04258)."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,18 +39,11 @@ def read(path: Path, files: list[Path], fps: float | None) -> Source:
     where it died, since the last row.
     """
     sensors: dict[arrays.Place, Sensor] = {}
-    with hdf5_file.open_file(files[0]) as file:
-        for part, (name, names) in _PARTS.items():
-            if f"frame_0_{part}" in file:
-                data = hdf5_file.numeric(file, f"frame_0_{part}")
-                kind = "image" if part == "x" else "vector"
-                valid = data.ndim == 1 if kind == "vector" else data.shape[2:] == (3,) and data.dtype == np.uint8
-                if not valid:
-                    raise DatasetError(f"{files[0]}/frame_0_{part} is {data.dtype} {list(data.shape)}, not a {kind}.")
-                if kind == "image":
-                    rows.check_size(data.shape[0], data.shape[1], f"{files[0]}/frame_0_x")
-                names = names if len(names) == len(data) else ()
-                sensors[part,] = Sensor(name, kind, data.shape, data.dtype.name, names, rate_hz=fps or FPS)
+    for path_of_take in files:
+        with hdf5_file.open_file(path_of_take) as file:
+            for part in _PARTS:
+                if (part,) not in sensors and f"frame_0_{part}" in file:
+                    sensors[part,] = _sensor(path_of_take, file, part, fps or FPS)
     base = path if path.is_dir() else path.parent
 
     def takes(rate: float) -> Iterator[Take]:
@@ -64,10 +57,23 @@ def read(path: Path, files: list[Path], fps: float | None) -> Source:
     return arrays.source(name, name, sensors, takes, fps=fps or FPS, about={"robot": "counter-strike"}, facts=facts)
 
 
-def _episode(path: Path, sensors: dict[arrays.Place, Sensor]) -> dict[arrays.Place, arrays.Array]:
+def _sensor(path: Path, file: hdf5_file.File, part: str, fps: float) -> Sensor:
+    name, names = _PARTS[part]
+    data = hdf5_file.numeric(file, f"frame_0_{part}")
+    kind = "image" if part == "x" else "vector"
+    valid = data.ndim == 1 if kind == "vector" else data.shape[2:] == (3,) and data.dtype == np.uint8
+    if not valid:
+        raise DatasetError(f"{path}/frame_0_{part} is {data.dtype} {list(data.shape)}, not a {kind}.")
+    if kind == "image":
+        rows.check_size(data.shape[0], data.shape[1], f"{path}/frame_0_x")
+    return Sensor(name, kind, data.shape, data.dtype.name, names if len(names) == len(data) else (), rate_hz=fps)
+
+
+def _episode(path: Path, sensors: Mapping[arrays.Place, Sensor]) -> dict[arrays.Place, arrays.Array]:
     with hdf5_file.open_file(path) as file:
         names = set(hdf5_file.names_in(file))
     frames = sum(bool(re.fullmatch(r"frame_\d+_x", key)) for key in names)
+    sensors = {(part,): it for (part,), it in sensors.items() if part == "x" or f"frame_0_{part}" in names}
     needed = [f"frame_{i}_{part}" for i in range(max(frames, 1)) for (part,) in sensors]
     if missing := [key for key in needed if key not in names]:
         raise DatasetError(f"{path} lacks {missing[0]}; it is truncated, or not a Counter-Strike recording.")

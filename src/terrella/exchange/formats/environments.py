@@ -25,14 +25,15 @@ def from_env(
     fps: rows per second. Default: from what the environment says of its steps (core/step_length.py), else rows.FPS_UNKNOWN.
 
     An episode is truncated after 1000 steps. There is one more observation than actions: the last one is kept. Spaces are
-    flattened as in minari.read. DatasetError for unknown ids, and spaces that are not arrays.
+    flattened as in minari.read; notes name the parts of observations that are no arrays, and the infos of `reset`.
+    DatasetError for unknown ids, and for an action or a whole observation that is no array.
     """
     if episodes < 1:
         raise DatasetError(f"{episodes} episodes make no recording; ask for 1 or more.")
     rows.check_fps(fps, "the rollout")
     made, name = _make(env)
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
-    made.reset(seed=seed)
+    infos = made.reset(seed=seed)[1]
     seconds, clock = step_length(made)
     stated = {"fps": seconds and 1 / seconds}
     made.close()
@@ -47,6 +48,13 @@ def from_env(
     sensors, notes = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
     if ";" in clock and fps is None:
         notes.append(f"{name} has {stated['fps']:g} steps a second by {clock}; give fps to correct that.")
+    if infos:
+        notes.append(f"the infos of {name} are left out ({', '.join(map(str, infos))}).")
+    odd = [place for place, leaf in leaves.items() if leaf and place not in sensors]
+    if any(place[0] == "actions" for place in odd) or not any(place[0] == "observations" for place in sensors):
+        what = ", ".join(map(arrays.spelled, odd)) or "observations without numbers"
+        raise DatasetError(f"'{what}' of {name} cannot be recorded; wrap the environment so that it has arrays.")
+    leaves = {place: leaf for place, leaf in leaves.items() if place not in odd}
 
     def takes(rate: float) -> Iterator[Take]:
         made, _ = _make(env)

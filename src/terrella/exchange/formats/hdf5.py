@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ...core.errors import DatasetError
 from ...data.source import Source, Take
-from . import counter_strike, d4rl, hdf5_file, robomimic, rows
+from . import counter_strike, d4rl, flat, hdf5_file, robomimic, rows
 
 SUFFIXES = (".hdf5", ".h5", ".hdf")
 
@@ -46,7 +48,8 @@ def _layout_of(path: Path) -> str:
                 return "robomimic"
         if "frame_0_x" in names and "frame_0_y" in names:
             return "counter-strike"
-        if "observations" in names and "actions" in names:
+        heads = {*names, *_below(file, names, "data"), *_below(file, names, "meta")}
+        if heads & set(flat.SPELLINGS[rows.ACTION]) and len(heads) > 1:
             return "d4rl"
         contents = ", ".join(sorted(names, key=rows.natural)[:12]) or "nothing"
     raise DatasetError(
@@ -55,11 +58,20 @@ def _layout_of(path: Path) -> str:
     )
 
 
+def _below(file: hdf5_file.File, names: list[str], name: str) -> list[str]:
+    item = hdf5_file.child(file, name) if name in names else None
+    return hdf5_file.names_in(item) if isinstance(item, hdf5_file.Group) else []
+
+
 def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
-    first = parts[0]
+    first, sensors = parts[0], dict(parts[0].sensors)
     for part, file in zip(parts, files):
-        if part.sensors != first.sensors or part.fps != first.fps:
-            raise DatasetError(f"{file} has other sensors than {files[0]}; convert each, and merge the results.")
+        for sensor in part.sensors.values():
+            known = sensors.setdefault(sensor.name, sensor)
+            if (sensor.kind, sensor.shape) != (known.kind, known.shape) or part.fps != first.fps:
+                raise DatasetError(f"{file} has other sensors than {files[0]}; convert each, and merge the results.")
+            if sensor.dtype != known.dtype:
+                sensors[sensor.name] = replace(known, dtype=np.promote_types(known.dtype, sensor.dtype).name)
     notes = tuple(dict.fromkeys(note for part in parts for note in part.notes))
     facts = {"files": {file.name: part.facts for file, part in zip(files, parts)}}
 
@@ -67,4 +79,4 @@ def _chained(name: str, parts: list[Source], files: list[Path]) -> Source:
         for part in parts:
             yield from part.takes()
 
-    return replace(first, name=name, takes=takes, notes=notes, facts=facts)
+    return replace(first, name=name, sensors=sensors, takes=takes, notes=notes, facts=facts)

@@ -133,6 +133,22 @@ def concatenated(file: File, count: int, *pieces: tuple[Place, int, int]) -> Arr
     return Array((size, *held[0].shape[1:]), held[0].dtype, read)
 
 
+def array_at(file: File, place: Place, item: Dataset) -> Array:
+    """A dataset of any type as an array that is read when its values are needed."""
+    if item.dtype.kind in "biuf" and item.ndim:
+        return concatenated(file, len(item), (place, 0, len(item)))
+    path = Path(file.filename)
+
+    def read(start: int, stop: int) -> np.ndarray:
+        with open_file(path) as again:
+            stored = child(subgroup(again, *place[:-1]), place[-1])
+            if not isinstance(stored, Dataset) or stored.size * stored.dtype.itemsize > _ALWAYS_ALLOWED_BYTES:
+                raise DatasetError(f"{path}, {place} is too large to be what it seems; leave it out.")
+            return np.asarray(stored[start:stop] if stored.ndim else stored[()])
+
+    return Array(item.shape, item.dtype, read)
+
+
 def headers(items: Iterable[tuple[tuple[str, ...], Dataset]]) -> dict[Place, Array]:
     """Shape and dtype of datasets, without their values."""
     return {place: Array(item.shape, item.dtype) for place, item in items}

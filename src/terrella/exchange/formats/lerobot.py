@@ -193,7 +193,7 @@ def _write_take(recorder: Recorder, take: Take, at: np.ndarray, has_rows: bool, 
             for time_s, value in zip(readings.time_s, readings.values):
                 recorder.log(name, value, float(time_s))
     recorder.end_episode(take.start_ns)
-    dropped = sorted(set(take.facts) - {"language"})
+    dropped = rows.facts_of(take)
     return notes + ([f"facts of single takes were not kept: {', '.join(dropped)}"] if dropped else [])
 
 

@@ -32,8 +32,8 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
     Each leaf of a Dict or Tuple space becomes a sensor: "observation.agent.pos", "action.0". A space of one array becomes
     "observation.state" or "action"; pictures become "observation.images.NAME". Integers stay integers. A Text leaf named
-    mission (or task, instruction, …) is the take's task; other texts are kept in its facts. Infos with a row per step in the
-    first episode become "info.NAME". next.done is Minari's termination, next.truncated its truncation. Spaces and metadata
+    mission (or task, instruction, …) is the take's task; other texts are kept in its facts. Infos with a row per step become
+    "info.NAME". next.done is Minari's termination, next.truncated its truncation. Spaces and metadata
     are kept as facts. A take has one more observation than actions.
 
     fps: rows per second. Default: as `write` stored it, else rows.FPS_UNKNOWN, because Minari stores none.
@@ -51,9 +51,8 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     known = {place: leaf for place, leaf in leaves.items() if leaf}
     shapes = {place: leaf.shape[1:] for place, leaf in known.items()}
     episode = open_storage(data, meta.get("data_format", "hdf5"), count)
-    for place, array in sorted(episode(0).arrays(shapes).items(), key=str):
-        if place[0] in _FOLLOW or place[0] == "infos":
-            known |= {place: array}
+    stored = arrays.union(episode(i).headers(shapes) for i in range(count))
+    known |= {place: it for place, it in sorted(stored.items(), key=str) if place[0] in _FOLLOW or place[0] == "infos"}
     own = meta["terrella"] if isinstance(meta.get("terrella"), dict) else {}
     described = rows.sensors_described(own, str(data)) if own else {}
     places = _places(Source("", described, tuple, facts=spaces_facts))[1] if described else {}
@@ -98,6 +97,9 @@ def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, 
     if not steps:
         raise DatasetError(f"{where} has no steps (rewards); remove it from the dataset.")
     own = {place: it for place, it in sensors.items() if place[0] != "infos" or _fits(stored.get(place), it)}
+    odd = [arrays.spelled(place) for place in sensors if place in stored and place not in own]
+    if lost := [place for place in own if place[0] in _ROLES and place not in stored]:
+        raise DatasetError(f"{where} lacks '{arrays.spelled(lost[0])}', an array of numbers; mend it, or drop it.")
     readings = arrays.readings(stored, own, np.arange(steps + 1) / fps, where)
     rows.rows_of(Take(readings), where)
     facts = episode.facts()
@@ -110,6 +112,7 @@ def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, 
         task=task,
         start_ns=start_ns if isinstance(start_ns, int) else None,
         facts={"minari": facts, **({"texts": kept} if kept else {})},
+        notes=tuple(f"'{name}' is left out where it is no array like that of the other episodes." for name in odd),
     )
 
 
@@ -178,7 +181,8 @@ def _structure(source: Source, root: str, role: str) -> tuple[dict, dict[Place, 
     try:
         leaves = spaces.leaves(space, role, "the source") if isinstance(space, dict) else {}
         known = {(root, *place): leaf for place, leaf in leaves.items() if leaf}
-        sensors, _ = arrays.columns(known, partial(arrays.sensor_at, _NAMES), "")
+        sensors, odd = arrays.columns(known, partial(arrays.sensor_at, _NAMES), "")
+        space = None if odd else space
     except DatasetError:
         leaves, sensors = {}, {}
     names = {place[1:]: sensor.name for place, sensor in sensors.items()}
@@ -231,6 +235,9 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
         ] = None
     if not rows.is_even(counts.time_s, source.fps):
         notes["Minari keeps no times: the true times of the rows were left out."] = None
+    texts = take.facts.get("texts")
+    for text in set(texts if isinstance(texts, Mapping) else ()) - {arrays.spelled(place) for place in places}:
+        notes[f"the text '{text}' has no place in this space and was left out."] = None
     for place, name in places.items():
         keys = "/".join(f"_index_{part}" if isinstance(part, int) else part for part in place)
         count = steps + (place[0] == "observations")

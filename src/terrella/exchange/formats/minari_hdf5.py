@@ -30,6 +30,9 @@ class Hdf5Episode:
                     arrays[place] = hdf5_file.concatenated(file, len(item), ((self._name, *names), 0, len(item)))
         return arrays
 
+    def headers(self, shapes: Shapes) -> dict[Place, Array]:
+        return self.arrays(shapes)
+
     def texts(self, place: Place) -> list[str]:
         with hdf5_file.open_file(self._path) as file:
             return hdf5_file.read_strings(self._dataset(file, place))

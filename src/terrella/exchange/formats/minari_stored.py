@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -22,6 +23,10 @@ class StoredEpisode(Protocol):
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
         """Every array with rows; JPEG pictures are decoded when they are read."""
+        ...
+
+    def headers(self, shapes: Shapes) -> dict[Place, Array]:
+        """`arrays` without the values."""
         ...
 
     def texts(self, place: Place) -> list[str]:
@@ -50,22 +55,37 @@ class TableEpisode:
     """A folder with metadata.json and part-0.arrow (or .parquet): one row per observation; the last row's action is padding."""
 
     def __init__(self, folder: Path, kind: str):
-        self._folder = folder
+        self._folder, self._kind = folder, kind
+
+    @cached_property
+    def _leaves(self) -> dict[tuple[str, ...], tuple]:
+        return self._opened(_arrow if self._kind == "arrow" else _parquet)
+
+    def _opened(self, read: Callable[[Path], pa.Table]) -> dict[tuple[str, ...], tuple]:
+        """The leaves of the tables that `read` reads from the files."""
+        folder, kind = self._folder, self._kind
         parts = sorted(folder.glob(f"*.{kind}"), key=rows.natural)
         if not parts:
             raise DatasetError(f"{folder} has no .{kind} file; restore the episode from a copy.")
         try:
-            table = pa.concat_tables([_arrow(part) if kind == "arrow" else _parquet(part) for part in parts])
+            table = pa.concat_tables(map(read, parts))
             table.validate(full=True)
             columns = {name: table.column(name).combine_chunks() for name in table.column_names}
-            self._leaves = {place: leaf for name, column in columns.items() for place, leaf in _leaves(column, (name,))}
+            return {place: leaf for name, column in columns.items() for place, leaf in _leaves(column, (name,))}
         except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError) as error:
             raise DatasetError(f"{folder} cannot be read ({str(error)[:200]}); restore it from a copy.") from error
 
     def arrays(self, shapes: Shapes) -> dict[Place, Array]:
+        return self._arrays(self._leaves, shapes)
+
+    def headers(self, shapes: Shapes) -> dict[Place, Array]:
+        schema = _arrow_schema if self._kind == "arrow" else _parquet_schema
+        return self._arrays(self._opened(lambda path: schema(path).empty_table()), shapes)
+
+    def _arrays(self, leaves: Mapping[tuple[str, ...], tuple], shapes: Shapes) -> dict[Place, Array]:
         known = {tuple(map(str, place)): place for place in shapes}
         arrays = {}
-        for names, (array, stated) in self._leaves.items():
+        for names, (array, stated) in leaves.items():
             place: Place = known.get(names) or names
             count = len(array) - (names[0] not in ("observations", "infos"))
             arrays[place] = self._array(array.slice(0, max(count, 0)), shapes.get(place, stated), spelled(names))
@@ -115,6 +135,15 @@ def _is_numeric(kind: pa.DataType) -> bool:
 
 def _arrow(path: Path) -> pa.Table:
     return pa.ipc.open_file(pa.memory_map(str(path))).read_all()
+
+
+def _arrow_schema(path: Path) -> pa.Schema:
+    return pa.ipc.open_file(pa.memory_map(str(path))).schema
+
+
+def _parquet_schema(path: Path) -> pa.Schema:
+    with pq.ParquetFile(as_local(path)) as file:
+        return file.schema_arrow
 
 
 def _parquet(path: Path) -> pa.Table:

@@ -12,6 +12,7 @@ from ...core.errors import DatasetError
 from ...core.files import creating
 from ...data.source import Sensor, Source, Take
 from . import arrays, hdf5_file, rows
+from .spaces import split_texts
 
 _NAMES = {
     "obs": rows.OBSERVATION,
@@ -23,6 +24,7 @@ _NAMES = {
 }
 _PLACES = {name: (key,) for key, name in _NAMES.items() if key != "obs"}
 _FLAGS = ("dones", "truncated")
+_TOP = ("data", "mask")
 
 
 def read(path: Path, fps: float | None) -> Source:
@@ -38,15 +40,15 @@ def read(path: Path, fps: float | None) -> Source:
         env_args = hdf5_file.json_attribute(data, "env_args")
         attributes = hdf5_file.attributes(data, ("total", "env_args", hdf5_file.OURS))
         facts = {"env_args": env_args, "mask": _mask(file), "attributes": attributes}
-        first = hdf5_file.headers(hdf5_file.all_datasets(hdf5_file.subgroup(data, demos[0])))
+        every = [_headers(hdf5_file.subgroup(data, name)) for name in demos]
+        notes = [f"'data/{name}' is left out: it is no demo." for name in hdf5_file.names_in(data) if name not in demos]
+        notes += [f"'{name}' is left out: it is not known." for name in hdf5_file.names_in(file) if name not in _TOP]
         task = hdf5_file.json_attribute(data, "problem_info").get("language_instruction")  # LIBERO's instruction
-    if ("actions",) not in first:
+    stored = arrays.union(every)
+    if ("actions",) not in stored:
         raise DatasetError(f"{path}/data has demos without actions; restore the file from a copy.")
-    unused = [place for place, it in first.items() if place[0] == "next_obs" or (place[0] != "obs" and 0 in it.shape)]
-    for place in unused:  # robomimic leaves `states` empty where there is no simulator
-        del first[place]
     described = rows.sensors_described(own, str(path)).values() if own else ()
-    sensors, notes = arrays.columns(first, _guess, "robomimic's", {_place(it) or (): it for it in described})
+    sensors, more = arrays.columns(stored, _guess, "robomimic's", {_place(it) or (): it for it in described})
     kwargs = env_args.get("env_kwargs")
     kwargs = kwargs if isinstance(kwargs, dict) else {}
     robots = kwargs.get("robots", "")
@@ -62,9 +64,18 @@ def read(path: Path, fps: float | None) -> Source:
         takes,
         fps=fps,
         about={**own, "fps": own.get("fps") or kwargs.get("control_freq"), "robot": own.get("robot") or robot},
-        notes=notes,
+        notes=[*notes, *more],
         facts={"robomimic": facts},
     )
+
+
+def _headers(demo: hdf5_file.Group) -> dict[arrays.Place, arrays.Array]:
+    """The arrays of a demo but for texts. robomimic leaves `states` empty where there is no simulator."""
+    return {
+        place: it
+        for place, it in hdf5_file.headers(hdf5_file.all_datasets(demo)).items()
+        if place[0] != "next_obs" and not (place[0] != "obs" and 0 in it.shape) and not it.is_text
+    }
 
 
 def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
@@ -94,17 +105,26 @@ def _demo(path: Path, name: str, sensors: Mapping[arrays.Place, Sensor], fps: fl
     where = f"{path}/data/{name}"
     with hdf5_file.open_file(path) as file:
         demo = hdf5_file.subgroup(file, "data", name)
-        steps = len(hdf5_file.numeric(demo, "actions"))
+        stored: dict[arrays.Place, hdf5_file.Dataset] = dict(hdf5_file.all_datasets(demo))
+        lead = next((place for place in (("actions",), *sensors) if place in stored), ("actions",))
+        steps = len(hdf5_file.numeric(hdf5_file.subgroup(demo, *lead[:-1]), lead[-1]))
         facts = hdf5_file.attributes(demo)
         claimed = facts.pop("num_samples", steps)
         if claimed != steps or not steps:
             raise DatasetError(f"{where} has {steps} actions where num_samples says {claimed}; restore or drop it.")
-        observed = [place for place in sensors if place[0] == "obs"]
+        observed = [place for place in sensors if place[0] == "obs" and place in stored]
         # a last observation after the last action needs every sensor
-        after = "next_obs" in demo and all(f"next_obs/{arrays.spelled(place[1:])}" in demo for place in observed)
+        after = all(("next_obs", *place[1:]) in stored for place in observed) and bool(observed)
+        unused = not after and any(place[0] == "next_obs" for place in stored)
+        lines = {
+            place: hdf5_file.array_at(file, ("data", name, *place), item)
+            for place, item in stored.items()
+            if item.ndim < 2 and item.dtype.kind in "SO" and place not in sensors
+        }
+        texts = {place: arrays.texts(array) for place, array in lines.items() if array.is_text}
         parts = {}
         for place in sensors:
-            if arrays.spelled(place) in demo:
+            if place in stored and not (place[0] != "obs" and 0 in stored[place].shape):
                 pieces = [(("data", name, *place), 0, steps)]
                 if after and place in observed:
                     pieces.append((("data", name, "next_obs", *place[1:]), steps - 1, steps))
@@ -112,8 +132,10 @@ def _demo(path: Path, name: str, sensors: Mapping[arrays.Place, Sensor], fps: fl
         own = {place: sensor for place, sensor in sensors.items() if place in parts}
         readings = arrays.readings(parts, own, np.arange(steps + after) / fps, where)
     lang = hdf5_file.json_object(facts.get("ep_meta")).get("lang")  # as robocasa and `write` store it
-    attributes = {"demo": name, "attributes": facts}
-    return Take(readings, task=lang if isinstance(lang, str) else task, facts={"robomimic": attributes})
+    task, kept = split_texts(texts, lang if isinstance(lang, str) else task)
+    more = {"robomimic": {"demo": name, "attributes": facts}, **({"texts": kept} if kept else {})}
+    notes = ("next_obs was left out where it lacks an observation.",) if unused else ()
+    return Take(readings, task, facts=more, notes=notes)
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:

@@ -1,4 +1,4 @@
-"""Folders of .npz episodes, one rollout each: read and written."""
+"""Folders of .npz files, of one rollout or many each: read and written."""
 
 import json
 import zipfile
@@ -13,28 +13,23 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from . import arrays, rows
+from . import arrays, flat, rows
 from .arrays import Array, Place
+from .spaces import split_texts
 
 ABOUT = "terrella.json"  # our description, in the folder of the episodes: names, units and frames
 TIME, TASK, START = "time_s", "task", "start_ns"
-_SPELLINGS = {  # `write` uses the first
-    rows.OBSERVATION: ("observations", "observation", "obs"),
-    rows.ACTION: ("actions", "action"),
-    rows.REWARD: ("rewards", "reward"),
-    rows.DONE: ("terminations", "terminated", "terminals", "dones", "done"),
-    rows.TRUNCATED: ("truncations", "truncated", "timeouts"),
-    rows.INFO: ("infos", "info"),
-}
-_NAMES = {spelling: role for role, spellings in _SPELLINGS.items() for spelling in spellings}
+_OWN = ((TIME,), (TASK,), (START,))
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
-    """A folder of .npz files, one episode each, in the natural order of their names (or one such file).
+    """A folder of .npz files in the natural order of their names, or one such file; each holds one episode or many.
 
-    Keys: observations (obs), actions, rewards, terminations (terminated, dones), truncations (truncated), infos; entries of
-    a Dict are "observations/NAME" or "obs.NAME". There are as many observations as actions, or one more. The first file
-    determines the sensors. Files of `write` keep their names, units, times and tasks. Pickled arrays are refused.
+    Keys: observations (obs), actions, rewards, terminations (terminated, dones, …), truncations (timeouts, …), infos; entries
+    of a Dict are "observations/NAME" or "obs.NAME". Flat arrays are cut into episodes, see flat.py, and other arrays with a row
+    for each step become "info.NAME" (pictures: observations). There are as many observations as actions, or one more. The
+    sensors are those of all files. A text that stays the same is the task. Files of `write` keep their names, units, times
+    and tasks. Pickled arrays are left out.
 
     fps: rows per second. Default: the folder's own, else rows.FPS_UNKNOWN with a note.
     DatasetError where there are no such files, or one is damaged or differs in shape from the first.
@@ -47,26 +42,36 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
     own = {_place(key): described[name] for name, key in _keys(described).items()}
-    first = _arrays(files[0])
-    candidates = {place: array for place, array in first.items() if place not in ((TIME,), (TASK,), (START,))}
-    sensors, notes = arrays.columns(candidates, partial(arrays.sensor_at, _NAMES), "the key", own)
+    every = [flat.split(_columns(file), str(file), bool(about)).stored for file in files]
+    stored = arrays.union(every)
+    bare = flat.is_bare(stored)
+    sensors, notes = arrays.columns(stored, partial(flat.guess, bare), "the key", own)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
-        keys = ", ".join(map(arrays.spelled, first)) or "nothing"
-        raise DatasetError(f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME.")
+        keys = ", ".join(map(arrays.spelled, every[0])) or "nothing"
+        raise DatasetError(
+            f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME. {' '.join(notes)}"
+        )
+    notes += [flat.BARE] * bare
 
     def takes(rate: float) -> Iterator[Take]:
-        return (_take(file, sensors, rate) for file in files)
+        for file in files:
+            yield from _takes(file, sensors, rate, bool(about))
 
     return arrays.source("the folder", path.stem, sensors, takes, fps=fps, about=about, notes=notes)
+
+
+def _columns(path: Path) -> dict[Place, Array]:
+    """The arrays of a file but for the times, task and start that `write` stores."""
+    return {place: array for place, array in _arrays(path).items() if place not in _OWN}
 
 
 def _place(key: str) -> Place:
     """The place of a key: "obs.front" -> ("obs", "front"); an unknown key is a place of its own."""
     for mark in ("/", "."):
         head, _, rest = key.partition(mark)
-        if head in _NAMES and rest:
+        if (head in flat.NAMES or head in flat.NEXT) and rest:
             return head, *rest.replace("/", ".").split(".")
-    return (key,)
+    return flat.home(tuple(key.split("/")))
 
 
 def _arrays(path: Path) -> dict[Place, Array]:
@@ -83,9 +88,9 @@ def _arrays(path: Path) -> dict[Place, Array]:
                     shape, _, dtype = read_header(member)
                 key = info.filename.removesuffix(".npy")
                 size = int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
-                if dtype.hasobject or size > min(rows.MAX_BYTES, info.file_size):
-                    raise DatasetError(f"'{key}' in {path} is {dtype} {list(shape)}: pickled, too large or cut off.")
-                stored[_place(key)] = Array(tuple(shape), dtype, _reader(path, key))
+                if size > min(rows.MAX_BYTES, info.file_size) and not dtype.hasobject:
+                    raise DatasetError(f"'{key}' in {path} is {dtype} {list(shape)}: too large or cut off.")
+                stored |= arrays.fields(_place(key), Array(tuple(shape), dtype, _reader(path, key)))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} does not exist; name a folder of .npz files.") from error
     except (OSError, EOFError, ValueError, SyntaxError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
@@ -100,7 +105,7 @@ def _reader(path: Path, key: str) -> Callable[[int, int], np.ndarray]:
     def read(start: int, stop: int) -> np.ndarray:
         if not kept:
             kept.append(_load(path, key))
-        return kept[0][start:stop]
+        return kept[0][start:stop] if kept[0].ndim else kept[0]
 
     return read
 
@@ -113,23 +118,35 @@ def _load(path: Path, key: str) -> np.ndarray:
         raise DatasetError(f"'{key}' in {path} cannot be read ({error}); restore it from a copy.") from error
 
 
-def _take(path: Path, sensors: Mapping[Place, Sensor], fps: float) -> Take:
+def _takes(path: Path, sensors: Mapping[Place, Sensor], fps: float, whole: bool) -> Iterator[Take]:
+    """The episodes of a file."""
     stored = _arrays(path)
-    rowwise = [place for place, it in sensors.items() if place in stored and rows.role_of(it.name) != rows.INFO]
-    count = max((stored[place].shape for place in rowwise), default=(0,))[0]
-    time_s = np.arange(count) / fps
-    if (TIME,) in stored:
-        time_s = _load(path, TIME)
-        if time_s.shape != (count,) or time_s.dtype.kind != "f":
-            raise DatasetError(
-                f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have as many."
-            )
+    episodes = flat.split({place: it for place, it in stored.items() if place not in _OWN}, str(path), whole)
     single = {key: _load(path, key) for key in (TASK, START) if (key,) in stored and stored[key,].shape == ()}
     start_ns = int(single[START]) if START in single else None
-    readings = arrays.readings(stored, sensors, time_s.astype(np.float64), str(path))
-    take = Take(readings, str(single.get(TASK, "")), start_ns, {"file": path.name})
-    rows.rows_of(take, str(path))
-    return take
+    for number, (start, stop) in enumerate(episodes.spans):
+        several = len(episodes.spans) > 1
+        where = f"{path}, rows {start} to {stop - 1}" if several else str(path)
+        parts = episodes.cut(number)
+        rowwise = [place for place, it in sensors.items() if place in parts and rows.role_of(it.name) != rows.INFO]
+        count = max((parts[place].shape for place in rowwise if parts[place].shape), default=(0,))[0]
+        time_s = _times(path, stored, start, count, several, fps)
+        task, kept = split_texts(episodes.texts_of(number), str(single.get(TASK, "")))
+        facts = {"file": path.name, **({"rows": [start, stop]} if several else {}), **({"texts": kept} if kept else {})}
+        take = Take(arrays.readings(parts, sensors, time_s, where), task, start_ns, facts)
+        rows.rows_of(take, where)
+        yield take
+
+
+def _times(path: Path, stored: Mapping[Place, Array], start: int, count: int, several: bool, fps: float) -> np.ndarray:
+    """The times of the rows of an episode: as stored, else `fps` a second."""
+    if (TIME,) not in stored:
+        return np.arange(count) / fps
+    time_s = _load(path, TIME)
+    own = time_s[start : start + count] if several else time_s
+    if own.shape != (count,) or own.dtype.kind != "f":
+        raise DatasetError(f"'{TIME}' in {path} has {list(time_s.shape)} times for {count} rows; it must have as many.")
+    return (own - own[0] if several else own).astype(np.float64)
 
 
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
@@ -161,15 +178,13 @@ def _keys(sensors: Mapping[str, Sensor]) -> dict[str, str]:
     keys: dict[str, str] = {}
     for name, role in roles.items():
         if role:
-            key, rest = _SPELLINGS[role][0], name.removeprefix(role).removeprefix(".")
+            key, rest = flat.SPELLINGS[role][0], name.removeprefix(role).removeprefix(".")
             keys[name] = f"{key}/{rest}" if rest and several[role] > 1 else key
     return keys
 
 
 def _write_take(path: Path, source: Source, take: Take, keys: Mapping[str, str], where: str) -> None:
-    if missing := [name for name in keys if name not in take.readings]:
-        raise DatasetError(f"{where} lacks '{missing[0]}', which other takes have; leave out the one or the other.")
-    kept = {name: take.readings[name] for name in keys}
+    kept = {name: take.readings[name] for name in keys if name in take.readings}
     counts = rows.rows_of(replace(take, readings=kept), where)
     arrays = {keys[name]: rows.stored_values(readings, source.sensors[name], where) for name, readings in kept.items()}
     arrays[TIME] = counts.time_s

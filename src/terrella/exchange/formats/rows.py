@@ -234,6 +234,13 @@ def rate_of(given: float | None, known: object, what: str) -> tuple[float, tuple
     )
 
 
+def facts_of(take: Take) -> list[str]:
+    """The names of the facts of a take but for its language; each of its texts is one: "texts observations/sign"."""
+    texts = take.facts.get("texts")
+    names = [f"texts {name}" for name in texts] if isinstance(texts, Mapping) else []
+    return sorted([*(set(take.facts) - {"language", "texts"}), *names])
+
+
 # -- our own description, stored with the arrays: names, units and frames
 
 

@@ -12,15 +12,17 @@ from .arrays import Array, Place
 from .rows import stored_shape
 
 _INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # Text spaces that hold the task
+_NO_ARRAYS = ("Sequence", "Graph", "OneOf", "Unknown")  # spaces whose values are not arrays of one shape
 _MAX_DEPTH = 32
 
 
 def leaves(space: object, role: str, where: str) -> dict[Place, Array | None]:
-    """Place (keys of Dicts, indices of Tuples) -> array without rows, for each leaf of a space given as JSON; None for texts."""
+    """Place (keys of Dicts, indices of Tuples) -> array without rows, for each leaf of a space given as JSON; None for texts. What
+    is no array of one shape (Sequence, Graph, …) is an array of objects, which `arrays.columns` names as left out."""
     try:
         return dict(_flat(space, ()))
     except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"the {role} space of {where} cannot be read ({error}).") from error
+        raise DatasetError(f"the {role} space of {where} cannot be recorded as numbers ({error}).") from error
 
 
 def _flat(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
@@ -33,21 +35,28 @@ def _flat(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
             yield from _flat(part, (*place, str(key) if kind == "Dict" else key))
     elif kind == "Text":
         yield place, None
+    elif kind in _NO_ARRAYS and place:
+        yield place, Array((), np.dtype(object))
     else:
         shape, dtype = _shape_of(kind, space)
         yield place, Array((0, *shape), np.dtype(dtype))
 
 
+def is_instruction(place: Place) -> bool:
+    """Whether a text at this place is an instruction, by its name."""
+    return str(place[-1]).lower() in _INSTRUCTIONS
+
+
 def split_texts(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[str, dict[str, list[str]]]:
-    """(a take's task, its other texts): a text named mission, task, … is the task if it stays the same for the whole take."""
-    kept = {}
-    for place, values in texts.items():
-        instruction = len(place) < 2 or str(place[-1]).lower() in _INSTRUCTIONS
-        if instruction and len(set(values)) == 1 and task in ("", values[0]):
-            task = values[0]
-        else:
-            kept["/".join(map(str, place))] = list(values)
-    return task, kept
+    """(a take's task, its other texts). The task is the text that stays the same for the whole take: of several the one that
+    is named mission, task, …"""
+    constant = {place: values[0] for place, values in texts.items() if len(set(values)) == 1}
+    named = [text for place, text in constant.items() if text and is_instruction(place)]
+    only = [text for text in constant.values() if text]
+    task = task or (named[0] if named else only[0] if len(only) == 1 else "")
+    return task, {
+        "/".join(map(str, place)): list(values) for place, values in texts.items() if constant.get(place) != task
+    }
 
 
 def _shape_of(kind: str, space) -> tuple[tuple[int, ...], str]:
@@ -81,7 +90,10 @@ def to_json(space: spaces.Space) -> dict:
     if isinstance(space, spaces.Text):
         low, high = space.min_length, space.max_length
         return {"type": "Text", "max_length": high, "min_length": low, "charset": space.characters}
-    raise DatasetError(f"spaces like {space} cannot be recorded; wrap the environment so that it has arrays.")
+    if getattr(space.dtype, "kind", "") == "U":  # as MiniGrid's missions, which are no Text
+        return {"type": "Text", "max_length": 1 << 16, "min_length": 0, "charset": ""}
+    name = type(space).__name__
+    return {"type": name if name in _NO_ARRAYS else "Unknown"}
 
 
 def compact(space):

@@ -1,0 +1,188 @@
+"""Flat arrays: one array per key for many episodes, and something that says where each of them ends.
+
+The layouts of D4RL (terminals, timeouts), OGBench (terminals; qpos, qvel beside), stable-baselines (episode_starts), Dreamer
+(is_first, is_last) and diffusion policy (data/…, meta/episode_ends).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...core.errors import DatasetError
+from ...data.source import Sensor
+from . import arrays, rows
+from .arrays import Array, Place
+from .spaces import is_instruction
+
+SPELLINGS = {  # `rollouts.write` uses the first
+    rows.OBSERVATION: ("observations", "observation", "obs"),
+    rows.ACTION: ("actions", "action", "acts"),
+    rows.REWARD: ("rewards", "reward", "rews"),
+    rows.DONE: ("terminations", "terminated", "terminals", "terminal", "dones", "done", "is_terminal"),
+    rows.TRUNCATED: ("truncations", "truncated", "timeouts"),
+    rows.INFO: ("infos", "info"),
+}
+NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in spellings}
+NEXT = ("next_observations", "next_observation", "next_obs")
+_LAST, _FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
+_ENDS = (
+    "episode_ends",
+    "traj_ends",
+)  # the row after the last one of each episode (or, if the very last is named, that one)
+_LENGTHS = ("episode_lengths", "traj_lengths")
+_NUMBERS = ("episode_index", "episode_id", "episode_ids", "traj_id", "traj_ids")  # of the episode of each row
+_FOLDERS = ("data", "meta")  # of diffusion policy's files
+BARE = "no array has a name of observations: all that have a row for each step are taken for them."
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The arrays of a file, and the rows [start, stop) of each of its episodes.
+
+    stored: place -> array. Those that have no row for each step are emptied, so that they are named as left out.
+    more:   place -> its rows beside those of the steps: 0, 1 at the very end, or 1 after each episode.
+    after:  place of an observation -> its array of next observations.
+    texts:  place -> texts with a row for each step, or one instruction for all.
+    """
+
+    stored: Mapping[Place, Array]
+    spans: list[tuple[int, int]]
+    more: Mapping[Place, int]
+    after: Mapping[Place, Array]
+    texts: Mapping[Place, Array]
+
+    def cut(self, number: int) -> dict[Place, Array]:
+        """The arrays of one episode."""
+        stop = self.spans[number][1]
+        parts = {place: self._part(number, place, array) for place, array in self.stored.items()}
+        for place, following in self.after.items():
+            parts[place] = _joined(parts[place], _slice(following, stop - 1, stop))
+        return parts
+
+    def texts_of(self, number: int) -> dict[Place, list[str]]:
+        """The texts of one episode."""
+        return {place: arrays.texts(self._part(number, place, array)) for place, array in self.texts.items()}
+
+    def _part(self, number: int, place: Place, array: Array) -> Array:
+        if len(self.spans) == 1 or not array.shape:
+            return array
+        (start, stop), more, last = self.spans[number], self.more[place], number == len(self.spans) - 1
+        shift = number if more > 1 else 0
+        return _slice(array, start + shift, stop + shift + (more > 1 or (more == 1 and last)))
+
+
+def home(place: Place) -> Place:
+    """A place without the folder of diffusion policy's layout: ("data", "action") -> ("action",)."""
+    return place[1:] if len(place) > 1 and place[0] in _FOLDERS else place
+
+
+def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
+    """The sensor of an array with a row for each step. One of an unknown name is a picture, if its bytes look like one; else
+    "info.NAME", or an observation if `bare`: no array has a name of observations."""
+    if place[0] in NAMES:
+        return arrays.sensor_at(NAMES, place, shape, dtype)
+    observed = bare or rows.picture_layout(shape, dtype) is not None
+    return rows.sensor_for(rows.OBSERVATION if observed else rows.INFO, arrays.joined(place), shape, dtype)
+
+
+def is_bare(stored: Mapping[Place, Array]) -> bool:
+    """Whether arrays have actions, or bounds of episodes, but no name of observations."""
+    heads = {str(place[0]) for place in stored}
+    acted = heads & {*SPELLINGS[rows.ACTION], *_ENDS, *_LENGTHS}
+    return bool(acted) and not heads & set(SPELLINGS[rows.OBSERVATION])
+
+
+def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Episodes:
+    """Cuts the arrays of a file into episodes: at the bounds that it states, else after each terminal and each timeout. Rows
+    after the last end are an episode too. `whole`: it holds one episode, whatever its flags say.
+
+    DatasetError where the bounds do not fit the rows.
+    """
+    count = _steps(stored)
+    ends = np.zeros(count, bool) if whole else _ends(stored, count, where)
+    if count > 1 and ends[-2:].all() and not ends[-3:-2].any():
+        ends[-2] = False  # flagged at the last step and at the terminal observation
+    stops = sorted({*(np.flatnonzero(ends) + 1).tolist(), count} - {0}) or [0]
+    spans = list(zip([0, *stops[:-1]], stops))
+    kept: dict[Place, Array] = {}
+    more: dict[Place, int] = {}
+    after: dict[Place, Array] = {}
+    texts: dict[Place, Array] = {}
+    for place, array in stored.items():
+        role, rest = NAMES.get(str(place[0])), place[1:]
+        if place[0] in (*_ENDS, *_LENGTHS):
+            continue
+        kept[place], more[place] = array, (array.shape[0] if array.shape else 0) - count
+        if array.dtype.kind in "USO" and len(array.shape) < 2:
+            rowwise, instruction = bool(array.shape) and more[place] in (0, 1, len(spans)), is_instruction(place)
+            if array.is_text and (rowwise or (instruction and not array.shape)):
+                texts[place] = kept.pop(place)
+            else:
+                kept[place] = Array((), array.dtype)
+            continue
+        following = next((stored[name, *rest] for name in NEXT if (name, *rest) in stored), None)
+        if role == rows.OBSERVATION and following is not None and following.shape == array.shape and not more[place]:
+            after[place] = following
+        surplus = {0} if role not in (rows.OBSERVATION, rows.INFO, None) else {0, 1, len(spans)}
+        if len(spans) > 1 and more[place] not in surplus:
+            if role not in (rows.INFO, None):
+                has = f"{array.shape[0] if array.shape else 'no'} rows where {count} are needed"
+                raise DatasetError(f"'{arrays.spelled(place)}' in {where} has {has}; mend or drop it.")
+            kept[place] = Array((), array.dtype)
+    observed = [place for place in kept if NAMES.get(str(place[0])) == rows.OBSERVATION]
+    after = after if len(after) == len(observed) else {}  # a last observation needs every sensor
+    for place in [place for place in kept if place[0] in NEXT]:
+        if after:
+            del kept[place]
+        else:
+            kept[place] = Array((), kept[place].dtype)
+    return Episodes(kept, spans, more, after, texts)
+
+
+def _steps(stored: Mapping[Place, Array]) -> int:
+    """The number of steps: rows of the actions, else of the flags, else of the first array."""
+    flags = (*SPELLINGS[rows.DONE], *SPELLINGS[rows.TRUNCATED], *_LAST, *_FIRST, *_NUMBERS)
+    arrayed = {place: array.shape[0] for place, array in stored.items() if array.shape}
+    for heads in (SPELLINGS[rows.ACTION], flags, SPELLINGS[rows.OBSERVATION]):
+        for place, count in arrayed.items():
+            if place[0] in heads:
+                return count
+    return max(arrayed.values(), default=0)
+
+
+def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
+    """bool [count]: the last step of each episode."""
+    ends, flags = np.zeros(count, bool), np.zeros(count, bool)
+    for (head, *rest), array in stored.items():
+        if rest or not array.is_numeric:
+            continue
+        rowwise = math.prod(array.shape) == array.shape[0] == count
+        if head in (*_ENDS, *_LENGTHS):
+            values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
+            stops = np.cumsum(values) if head in _LENGTHS else values + (values.max(initial=0) == count - 1)
+            if (np.diff(stops, prepend=0) < 1).any() or stops.max(initial=0) > count:
+                raise DatasetError(f"'{head}' in {where} does not fit its {count} rows; mend it, or drop it.")
+            ends[stops - 1] = True
+        elif rowwise and head in _NUMBERS:
+            ends[:-1] |= np.diff(array.read(0, count).reshape(-1)) != 0
+        elif rowwise and head in _FIRST:
+            ends[:-1] |= array.read(0, count).reshape(-1)[1:].astype(bool)
+        elif rowwise and (head in _LAST or NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)):
+            flags |= array.read(0, count).reshape(-1).astype(bool)
+    return ends if ends.any() else flags
+
+
+def _slice(array: Array, start: int, stop: int) -> Array:
+    return replace(array, shape=(stop - start, *array.shape[1:]), read=lambda a, b: array.read(start + a, start + b))
+
+
+def _joined(one: Array, other: Array) -> Array:
+    count = one.shape[0]
+
+    def read(start: int, stop: int) -> np.ndarray:
+        begin, end = (max(at - count, 0) for at in (start, stop))
+        return np.concatenate([one.read(min(start, count), min(stop, count)), other.read(begin, end)])
+
+    return replace(one, shape=(count + other.shape[0], *one.shape[1:]), read=read)

@@ -1,0 +1,114 @@
+"""Flat arrays of many episodes, in the layouts that people share: each is cut where its episodes end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrella.core.errors import DatasetError
+from terrella.data import Dataset
+from terrella.exchange import open_source, write_source
+
+ROWS, LENGTHS = 12, (5, 4, 3)  # the last episode of some layouts is unfinished
+FIRST = np.isin(np.arange(ROWS), [0, 5, 9])
+LAST = np.isin(np.arange(ROWS), [4, 8, 11])
+STATE = np.arange(ROWS * 2, dtype=np.float32).reshape(ROWS, 2)
+ACTION = np.arange(ROWS, dtype=np.float32)[:, None]
+BOUNDS = {
+    "OGBench": {"terminals": LAST.astype(np.float32)},
+    "D4RL": {"terminals": np.arange(ROWS) == 4, "timeouts": np.arange(ROWS) == 8},
+    "dones": {"dones": np.isin(np.arange(ROWS), [4, 8])},
+    "Gymnasium": {"terminations": np.zeros(ROWS, bool), "truncations": LAST},
+    "stable-baselines": {"episode_starts": FIRST, "episode_returns": np.zeros(3)},
+    "Dreamer": {"is_first": FIRST, "is_last": LAST, "is_terminal": np.zeros(ROWS, bool)},
+    "diffusion policy": {"meta/episode_ends": np.array([5, 9, 12])},
+    "lengths": {"episode_lengths": np.array(LENGTHS)},
+    "numbers": {"episode_index": np.repeat([7, 3, 9], LENGTHS)},
+}
+
+
+def saved(path, arrays: dict) -> None:
+    if path.suffix == ".npz":
+        return np.savez(path, **arrays)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for key, values in arrays.items():
+            file[key] = values
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+@pytest.mark.parametrize("layout", BOUNDS)
+def test_every_layout_is_cut_where_its_episodes_end(tmp_path, layout, suffix):
+    saved(tmp_path / f"a{suffix}", {"observations": STATE, "actions": ACTION, **BOUNDS[layout]})
+    takes = list(open_source(tmp_path / f"a{suffix}").takes())
+    for take, start, length in zip(takes, (0, 5, 9), LENGTHS, strict=True):
+        np.testing.assert_array_equal(take.readings["observation.state"].values, STATE[start : start + length])
+        np.testing.assert_array_equal(take.readings["action"].values, ACTION[start : start + length])
+        np.testing.assert_allclose(take.readings["action"].time_s, np.arange(length) / 10)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+def test_what_lies_beside_the_observations_is_kept_or_named(tmp_path, suffix):
+    eye = np.random.default_rng(0).integers(0, 256, (ROWS, 40, 32, 3), np.uint8)
+    more = {"qpos": np.arange(ROWS * 3.0).reshape(ROWS, 3), "wrist": eye, "goal": np.zeros(2), "gamma": np.array(0.9)}
+    saved(tmp_path / f"a{suffix}", {"observations": STATE, "actions": ACTION, "terminals": LAST, **more})
+    source = open_source(tmp_path / f"a{suffix}", fps=10)
+    assert {"info.qpos", "observation.images.wrist"} <= set(source.sensors)
+    assert sum("goal" in note for note in source.notes) == sum("gamma" in note for note in source.notes) == 1
+    write_source(source, tmp_path / "set")
+    data = Dataset(tmp_path / "set")
+    assert [episode.length for episode in data.episodes] == list(LENGTHS)
+    np.testing.assert_array_equal(data.episode(1)["info.qpos"], more["qpos"][5:9])
+
+
+def test_terminal_observations_are_the_episodes_own(tmp_path):
+    after = STATE + 0.5
+    saved(tmp_path / "next.npz", {"obs": STATE, "next_obs": after, "acts": ACTION, "dones": LAST})
+    saved(tmp_path / "more.npz", {"obs": np.arange(ROWS + 3.0), "acts": ACTION, "dones": LAST})
+    saved(tmp_path / "end.npz", {"obs": np.arange(ROWS + 1.0), "acts": ACTION, "dones": LAST})
+    seen = {
+        name: [
+            take.readings["observation.state"].values.ravel().tolist() for take in open_source(tmp_path / name).takes()
+        ]
+        for name in ("next.npz", "more.npz", "end.npz")
+    }
+    assert seen["next.npz"][1] == [*STATE[5:9].ravel().tolist(), *after[8].tolist()]
+    assert seen["more.npz"] == [list(range(6)), list(range(6, 11)), list(range(11, 15))]
+    assert seen["end.npz"] == [list(range(5)), list(range(5, 9)), list(range(9, 13))]
+
+
+def test_one_episode_that_is_done_twice_is_one(tmp_path):
+    saved(tmp_path / "a.npz", {"observations": STATE, "actions": ACTION, "dones": np.arange(ROWS) > 9})
+    (take,) = open_source(tmp_path / "a.npz").takes()
+    assert len(take.readings["action"].values) == ROWS
+
+
+def test_records_of_several_fields_and_files_without_observations_are_read(tmp_path):
+    fields = np.zeros(ROWS, [("position", "f4", (3,)), ("grip", "f4")])
+    fields["position"], fields["grip"] = np.arange(ROWS)[:, None], 7
+    saved(tmp_path / "a.npz", {"observations": fields, "actions": ACTION, "terminals": LAST})
+    (first, *_) = open_source(tmp_path / "a.npz").takes()
+    np.testing.assert_array_equal(first.readings["observation.position"].values[:, 2], np.arange(5))
+    assert first.readings["observation.grip"].values.tolist() == [[7]] * 5
+    saved(tmp_path / "b.npz", {"data/action": ACTION, "data/state": STATE, "meta/episode_ends": np.array([5, 9, 12])})
+    source = open_source(tmp_path / "b.npz")
+    assert set(source.sensors) == {"action", "observation.state"} and len(list(source.takes())) == 3
+    assert any("no array has a name of observations" in note for note in source.notes)
+
+
+def test_texts_are_the_task_or_named_and_pickles_are_named(tmp_path):
+    order = np.repeat(["open the drawer", "close it", "wave"], LENGTHS)
+    odd = np.array([{"a": 1}] * ROWS, object)
+    arrays = {"observations": STATE, "actions": ACTION, "terminals": LAST, "mission": order, "env": np.array("maze")}
+    saved(tmp_path / "a.npz", {**arrays, "infos": odd, "observations/said": np.arange(ROWS).astype(str)})
+    notes = write_source(open_source(tmp_path / "a.npz"), tmp_path / "set")
+    assert [episode.task for episode in Dataset(tmp_path / "set").episodes] == ["open the drawer", "close it", "wave"]
+    for name in ("infos", "env", "observations/said"):
+        assert any(name in note for note in notes), name
+
+
+def test_bounds_that_do_not_fit_are_refused(tmp_path):
+    for bounds in ({"episode_ends": np.array([5, 99])}, {"episode_ends": np.array([5, 5])}):
+        saved(tmp_path / "a.npz", {"observations": STATE, "actions": ACTION, **bounds})
+        with pytest.raises(DatasetError, match="episode_ends.*does not fit its 12 rows"):
+            open_source(tmp_path / "a.npz")
