@@ -169,7 +169,7 @@ BAD = {
     "version 1": struct.pack("<4sII", b"glTF", 1, 20) + bytes(8),
     "no JSON": struct.pack("<4sIII4s", b"glTF", 2, 24, 4, b"JSON") + b"{{{{",
     "compressed": glb(extensionsRequired=["KHR_draco_mesh_compression"]),
-    "of an unknown kind": glb(extensionsRequired=["EXT_mesh_gpu_instancing"]),
+    "of an unknown kind": glb(extensionsRequired=["CESIUM_RTC"]),
     "no triangles": glb(nodes=[{"name": "nothing"}]),
     "a circle": glb(nodes=[{"children": [0]}]),
     "many": glb(nodes=ONE, accessors=[{"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
@@ -183,6 +183,13 @@ BAD = {
     "no material": glb(materials=[]),
     "no number": glb(nodes=[{"mesh": 0, "translation": [float("nan"), 0, 0]}]),
     "sparse": glb(accessors=[{"count": 3, "sparse": {}}] * 2),
+    "sparse without end": glb(accessors=[{"componentType": 5126, "count": 1 << 40, "type": "VEC3"}] * 2),
+    "instances without end": glb(
+        nodes=[{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {"attributes": {"SCALE": 2}}}}],
+        accessors=[{"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3"},
+                   {"bufferView": 1, "componentType": 5125, "count": 36, "type": "SCALAR"},
+                   {"componentType": 5126, "count": 1 << 24, "type": "VEC3"}],
+    ),
 }  # fmt: skip
 SAID = {
     "compressed": "without compression",

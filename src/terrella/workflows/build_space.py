@@ -182,11 +182,12 @@ def _of_triangles(
     save_splat(world_of(splats, file.stem, card, _splat_config(size, WALKER), objects, SolidBoxes.of(solids)), out)
     facts: Mapping[str, Any] = {
         "world": str(out), "gaussians": len(splats), "triangles": len(scene.corners), "objects": names,
-        "lights": len(scene.lights), "boxes": None if solids is None else len(solids),
+        "lights": len(scene.lights), "boxes": None if solids is None else len(solids), "left_out": list(scene.left_out),
     }  # fmt: skip
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     text = f"{len(splats):,} Gaussians of {len(scene.corners):,} triangles, {len(scene.lights)} light(s): {shown}"
-    return SpaceResult(facts, (text, f"walk in it: terrella play {out}"))
+    more = [f"left out: {', '.join(scene.left_out)}"] if scene.left_out else []
+    return SpaceResult(facts, (text, *more, f"walk in it: terrella play {out}"))
 
 
 def _is_size(size: tuple[int, int]) -> bool:

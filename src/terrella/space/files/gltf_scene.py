@@ -1,5 +1,6 @@
 """The scene of a glTF file: triangles in the world with colours, pictures and names; lights; or Gaussians."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,25 +14,13 @@ from ...core.errors import DatasetError
 from ..raster import Gaussians, join
 from ..raster.move import transform
 from .gltf import Gltf, open_gltf
+from .gltf_material import Material, MaterialPicture, base_of, material_of, transformed_uv
 
-MOST_FACES, MOST_NODES, MOST_LIGHTS, MOST_PICTURES = 2_000_000, 100_000, 64, 256
+MOST_FACES, MOST_NODES, MOST_LIGHTS = 2_000_000, 100_000, 64
+MOST_JOINTS = 4  # groups of four
 GLTF_ENDINGS = (".glb", ".gltf")
 SPLATS = "KHR_gaussian_splatting"
 _AXES = np.array([[0.0, -1, 0], [0, 0, 1], [-1, 0, 0]])  # a point of glTF [3] times this is ours
-
-
-@dataclass(frozen=True)
-class Material:
-    """colour (red, green, blue, opacity) and glow (red, green, blue), linear; picture uint8 [h, w, 4], sRGB; placed: scale and
-    offset of its u v; unlit: colours include light; see_through: opacity counts; cut: what is less opaque is invisible."""
-
-    colour: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
-    glow: tuple[float, ...] = (0.0, 0.0, 0.0)
-    picture: np.ndarray | None = None
-    placed: tuple[float, ...] = (1.0, 1.0, 0.0, 0.0)
-    unlit: bool = False
-    see_through: bool = False
-    cut: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -48,8 +37,8 @@ class Light:
 
 @dataclass(frozen=True)
 class GltfScene:
-    """corners float32 [F, 3, 9] of triangles: x y z (world frame, metres), tint red green blue opacity (linear), u v; int32 [F]:
-    the index in `materials` of each, and in `names`, from 1."""
+    """corners float32 [F, 3, 9] of triangles: x y z (world frame, metres), tint red green blue opacity (linear), u v of its
+    pictures; int32 [F]: the index in `materials` of each, and in `names`, from 1; left_out: what of the file is not read."""
 
     corners: np.ndarray
     material: np.ndarray
@@ -57,20 +46,28 @@ class GltfScene:
     materials: tuple[Material, ...]
     names: tuple[str, ...]
     lights: tuple[Light, ...]
+    left_out: tuple[str, ...] = ()
 
 
 def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
-    """The triangles and lights of a .glb or .gltf, or its Gaussians (KHR_gaussian_splatting; in glTF's own frame). scale: metres
-    per unit of the file. DatasetError for a broken or too large file."""
+    """The triangles and lights of a .glb or .gltf in its pose at rest, or its Gaussians (KHR_gaussian_splatting; in glTF's own
+    frame; a warning names what else there is). scale: metres per unit of the file. DatasetError for a broken, compressed or too
+    large file."""
     path = Path(path)
     try:
         file = open_gltf(path)
-        nodes = list(_nodes(file, np.diag([scale, scale, scale, 1.0])))
+        placed = list(_nodes(file, np.diag([scale, scale, scale, 1.0])))
+        places = {index: matrix for index, _, matrix in placed}
+        nodes = [one for _, node, matrix in placed for one in _instances(file, node, matrix)]
         parts = [(node, matrix, part) for node, matrix in nodes for part in _parts(file, node)]
+        if len(parts) > MOST_NODES:
+            raise ValueError(f"it has {len(parts):,} things, {MOST_NODES:,} is the most")
         splats = [one for one in parts if SPLATS in one[2].get("extensions", {})]
-        if splats:
-            return join([_gaussians(file, matrix, part["attributes"]) for _, matrix, part in splats])
-        return _scene(file, nodes, [one for one in parts if one[2].get("mode", 4) == 4])
+        if not splats:
+            return _scene(file, nodes, parts, places)
+        if left_out := [*file.unread(), *([f"{len(parts) - len(splats)} meshes"] if len(parts) > len(splats) else [])]:
+            warnings.warn(f"beside its Gaussians the file has {', '.join(left_out)}, which are left out.", stacklevel=2)
+        return join([_gaussians(file, matrix, part["attributes"]) for _, matrix, part in splats])
     except (
         OSError,
         ValueError,
@@ -86,9 +83,11 @@ def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
         ) from error
 
 
-def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """All nodes of the shown scene, each with its matrix [4, 4] to the world, which ends with `whole`."""
+def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
+    """All visible nodes of the shown scene: the number of each, and its matrix [4, 4] to the world, which ends with `whole`."""
     about = file.about
+    if len(about.get("nodes", [])) > MOST_NODES:
+        raise ValueError(f"it has {len(about['nodes']):,} nodes, {MOST_NODES:,} is the most")
     if "scenes" in about:
         roots = file.named("scenes", about.get("scene", 0)).get("nodes", [])
     else:
@@ -97,13 +96,36 @@ def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[dict[str, Any], np.n
     waiting, seen = [(root, whole) for root in reversed(roots)], set()
     while waiting:
         index, above = waiting.pop()
-        if index in seen or len(seen) > MOST_NODES:
-            raise ValueError(f"its nodes go in a circle, or are more than {MOST_NODES:,}")
+        if index in seen:
+            raise ValueError("its nodes go in a circle")
         node = file.named("nodes", index)
         seen.add(index)
+        if node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible") is False:
+            continue
         matrix = above @ _matrix(node)
-        yield node, matrix
+        yield index, node, matrix
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+
+
+def _instances(file: Gltf, node: dict[str, Any], matrix: np.ndarray) -> list[tuple[dict[str, Any], np.ndarray]]:
+    """The node, or each of its instances (EXT_mesh_gpu_instancing) with its own name."""
+    given = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
+    widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
+    moves = {name.lower(): file.numbers(given[name], width) for name, width in widths.items() if name in given}
+    if not moves or "mesh" not in node:
+        return [(node, matrix)]
+    name, count = _name(file, node) or "thing", min(map(len, moves.values()))
+    if count > MOST_NODES:
+        raise ValueError(f"it has {count:,} instances of {name}, {MOST_NODES:,} is the most")
+    bare = {key: value for key, value in node.items() if key not in ("extensions", "skin")}
+    return [
+        ({**bare, "name": f"{name} {k + 1}"}, matrix @ _matrix({key: rows[k] for key, rows in moves.items()}))
+        for k in range(count)
+    ]
+
+
+def _name(file: Gltf, node: dict[str, Any]) -> str:
+    return str(node.get("name") or file.named("meshes", node["mesh"]).get("name") or "")[:80]
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
@@ -127,53 +149,77 @@ def _parts(file: Gltf, node: dict[str, Any]) -> list[dict[str, Any]]:
     return file.named("meshes", node["mesh"])["primitives"] if "mesh" in node else []
 
 
-def _scene(file: Gltf, nodes: list, parts: list) -> GltfScene:
-    many = sum(file.count(part.get("indices", part["attributes"]["POSITION"])) // 3 for *_, part in parts)
+def _scene(file: Gltf, nodes: list, parts: list, places: dict[int, np.ndarray]) -> GltfScene:
+    solid = [one for one in parts if one[2].get("mode", 4) in _CORNERS]
+    many = sum(_count(file, part) for *_, part in solid)
     if many > MOST_FACES:
         raise ValueError(f"it has {many:,} triangles, {MOST_FACES:,} is the most: decimate it")
-    names: list[str] = []
-    numbers: dict[int, int] = {}
+    left_out = file.unread()
+    if len(parts) > len(solid):
+        left_out.append(f"{len(parts) - len(solid)} meshes of points or lines")
+    if file.about.get("animations"):
+        left_out.append("animations")
+    abouts, names, numbers = file.about.get("materials", []), list[str](), dict[int, int]()
     corners, material, things = [], [], []
-    for node, matrix, part in parts:
-        one = _triangles(file, matrix, part)
+    for node, matrix, part in solid:
+        which = part.get("material", -1)
+        if type(which) is not int or not -1 <= which < len(abouts):
+            raise ValueError("it speaks of a material which it has not")
+        one = _triangles(file, node, matrix, part, base_of(abouts[which] if which >= 0 else {})[1], places)
         if id(node) not in numbers:
-            name = node.get("name") or file.named("meshes", node["mesh"]).get("name") or f"thing {len(names) + 1}"
-            names.append(str(name)[:80])
+            names.append(_name(file, node) or f"thing {len(names) + 1}")
             numbers[id(node)] = len(names)
         corners.append(one)
-        material.append(np.full(len(one), part.get("material", -1), np.int32))
+        material.append(np.full(len(one), which, np.int32))
         things.append(np.full(len(one), numbers[id(node)], np.int32))
     if not sum(map(len, corners)):
         raise ValueError("it has no triangles")
-    which, abouts = np.concatenate(material), file.about.get("materials", [])
-    if which.max() >= len(abouts) or which.min() < -1:
-        raise ValueError("it speaks of a material which it has not")
-    used, which = np.unique(which, return_inverse=True)
-    pictures: dict[int, np.ndarray] = {}
-    looks = tuple(_material(file, abouts[k] if k >= 0 else {}, pictures) for k in used.tolist())
+    used, which = np.unique(np.concatenate(material), return_inverse=True)
+    pictures: dict[int, MaterialPicture | None] = {}
+    looks = tuple(material_of(file, abouts[k] if k >= 0 else {}, pictures, left_out) for k in used.tolist())
     tables = np.concatenate(corners), which.astype(np.int32), np.concatenate(things)
-    return GltfScene(*tables, looks, tuple(names), _lights(file, nodes))
+    return GltfScene(*tables, looks, tuple(names), _lights(file, nodes), tuple(left_out))
 
 
-def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarray:
+def _count(file: Gltf, part: dict[str, Any]) -> int:
+    """Triangles of a primitive."""
+    rows = file.count(part.get("indices", part["attributes"]["POSITION"]))
+    return rows // 3 if part.get("mode", 4) == 4 else max(rows - 2, 0)
+
+
+def _triangles(
+    file: Gltf,
+    node: dict[str, Any],
+    matrix: np.ndarray,
+    part: dict[str, Any],
+    texture: dict[str, Any],
+    places: dict[int, np.ndarray],
+) -> np.ndarray:
     """Corners [F, 3, 9] of a primitive, without triangles that have no area or are not finite."""
+    file.check_uncompressed(part)
     given = part["attributes"]
-    places = file.numbers(given["POSITION"], 3)
-    count = len(places)
-    rows = np.zeros((count, 9), np.float32)
+    points = _points(file, node, part)
+    rows = np.zeros((len(points), 9), np.float32)
+    if "skin" in node and "JOINTS_0" in given:
+        points, matrix = _skinned(file, node, given, points, places), np.eye(4)
     with np.errstate(over="ignore", invalid="ignore"):
-        rows[:, :3] = (places @ matrix[:3, :3].T + matrix[:3, 3]) @ _AXES
+        rows[:, :3] = (points @ matrix[:3, :3].T + matrix[:3, 3]) @ _AXES
     rows[:, 3:7] = 1
-    for name, first, widths in (("COLOR_0", 3, (3, 4)), ("TEXCOORD_0", 7, (2,))):
+    transform_uv = texture.get("extensions", {}).get("KHR_texture_transform", {})
+    uv = f"TEXCOORD_{transform_uv.get('texCoord', texture.get('texCoord', 0))}"
+    for name, first, widths in (("COLOR_0", 3, (3, 4)), (uv, 7, (2,))):
         if name in given:
             values = file.numbers(given[name], *widths)
-            if len(values) != count:
-                raise ValueError(f"its {name} are {len(values):,} and its points {count:,}")
+            if len(values) != len(points):
+                raise ValueError(f"its {name} are {len(values):,} and its points {len(points):,}")
+            if first == 3 and values.dtype.kind in "iu":  # colours that lack the mark "normalized"
+                values = values / np.iinfo(values.dtype).max
             rows[:, first : first + values.shape[1]] = values
-    index = file.numbers(part["indices"], 1)[:, 0].astype(np.int64) if "indices" in part else np.arange(count)
-    if len(index) and not 0 <= index.min() <= index.max() < count:
+    rows[:, 7:] = transformed_uv(rows[:, 7:], transform_uv)
+    index = file.numbers(part["indices"], 1)[:, 0].astype(np.int64) if "indices" in part else np.arange(len(points))
+    if len(index) and not 0 <= index.min() <= index.max() < len(points):
         raise ValueError("a triangle of it has a corner which it has not")
-    index = index[: len(index) // 3 * 3].reshape(-1, 3)
+    index = index[_CORNERS[part.get("mode", 4)](np.arange(_count(file, part)))]
     corners = rows[index[:, [0, 2, 1]] if np.linalg.det(matrix[:3, :3]) < 0 else index]
     with np.errstate(over="ignore", invalid="ignore"):
         first, second = corners[:, 1, :3] - corners[:, 0, :3], corners[:, 2, :3] - corners[:, 0, :3]
@@ -181,26 +227,44 @@ def _triangles(file: Gltf, matrix: np.ndarray, part: dict[str, Any]) -> np.ndarr
     return corners[np.isfinite(corners).all((1, 2)) & np.isfinite(area) & (area > 1e-12)]
 
 
-def _material(file: Gltf, about: dict[str, Any], pictures: dict[int, np.ndarray]) -> Material:
-    """The material of an entry; `pictures` caches decoded pictures."""
-    surface, more = about.get("pbrMetallicRoughness", {}), about.get("extensions", {})
-    texture = surface.get("baseColorTexture", {})
-    index, bent = texture.get("index"), texture.get("extensions", {}).get("KHR_texture_transform", {})
-    if index is not None and index not in pictures:
-        if len(pictures) == MOST_PICTURES:
-            raise ValueError(f"it has more than {MOST_PICTURES} pictures: join some")
-        pictures[index] = file.picture(index)
-    strength = float(more.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
-    mode = about.get("alphaMode", "OPAQUE")
-    return Material(
-        tuple(map(float, surface.get("baseColorFactor", (1, 1, 1, 1)))),
-        tuple(strength * float(part) for part in about.get("emissiveFactor", (0, 0, 0))),
-        None if index is None else pictures[index],
-        (*map(float, bent.get("scale", (1, 1))), *map(float, bent.get("offset", (0, 0)))),
-        "KHR_materials_unlit" in more,
-        mode == "BLEND",
-        float(about.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.0,
-    )
+# mode of a primitive (triangles, strip, fan) -> the rows of its corners [F, 3] by the number of the triangle [F]
+_CORNERS = {
+    4: lambda k: np.stack([3 * k, 3 * k + 1, 3 * k + 2], 1),
+    5: lambda k: np.stack([k, k + 1 + k % 2, k + 2 - k % 2], 1),
+    6: lambda k: np.stack([k + 1, k + 2, 0 * k], 1),
+}
+
+
+def _points(file: Gltf, node: dict[str, Any], part: dict[str, Any]) -> np.ndarray:
+    """The places [N, 3] of a primitive's corners, with the morph targets of its pose at rest."""
+    points = file.numbers(part["attributes"]["POSITION"], 3)
+    weights = node.get("weights", file.named("meshes", node["mesh"]).get("weights", []))
+    for weight, target in zip(weights, part.get("targets", [])):
+        if weight and "POSITION" in target:
+            points = points + float(weight) * file.numbers(target["POSITION"], 3)
+    return points
+
+
+def _skinned(
+    file: Gltf, node: dict[str, Any], given: dict[str, Any], points: np.ndarray, places: dict[int, np.ndarray]
+) -> np.ndarray:
+    """The points [N, 3] as the joints of the node's skin hold them, in the world."""
+    skin = file.named("skins", node["skin"])
+    joints = np.stack([places[joint] for joint in skin["joints"]])
+    if "inverseBindMatrices" in skin:
+        joints = (
+            joints @ file.numbers(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
+        )
+    whole, total = np.concatenate([points, np.ones((len(points), 1))], 1), np.zeros((len(points), 4))
+    for group in range(MOST_JOINTS):
+        if f"JOINTS_{group}" not in given:
+            break
+        which, weights = file.numbers(given[f"JOINTS_{group}"], 4), file.numbers(given[f"WEIGHTS_{group}"], 4)
+        if which.max() >= len(joints) or len(which) != len(points):
+            raise ValueError("its skin speaks of a joint which it has not")
+        for joint, weight in zip(which.T, weights.T):
+            total += weight[:, None] * (joints[joint] @ whole[..., None])[..., 0]
+    return total[:, :3] / np.where(total[:, 3:] > 0, total[:, 3:], 1)
 
 
 def _lights(file: Gltf, nodes: list) -> tuple[Light, ...]:

@@ -18,6 +18,7 @@ _INNER = (
     np.array([[i + 1 / 3, j + 1 / 3, 4 - i - j - 2 / 3] for i in range(4) for j in range(4 - i)]) / 4
 )  # in a triangle
 _SEEN = 0.02  # opacity
+_DARK = 1e-3  # a surface that glows less than this does not
 
 
 def of_triangles(scene: GltfScene, count: int = 120_000) -> tuple[Gaussians, torch.Tensor, torch.Tensor | None]:
@@ -50,19 +51,17 @@ def _surface(
         rows = np.flatnonzero(which == k)
         tint[rows] *= np.array(material.colour, np.float32)
         glow[rows], unlit[rows] = material.glow, material.unlit
-        if material.picture is not None and len(rows):
-            height, width = material.picture.shape[:2]
+        if len(rows) and (material.picture or material.glow_picture):
             u, v = np.moveaxis(_INNER.astype(np.float32) @ corners[rows, :, 7:9], -1, 0)
-            u, v = u * material.placed[0] + material.placed[2], v * material.placed[1] + material.placed[3]
-            at = ((np.nan_to_num(part) % 1 * side).astype(int) % side for part, side in ((v, height), (u, width)))
-            texels = (material.picture[tuple(at)] / np.float32(255)).astype(np.float32)
-            texels[..., :3] **= 2.2
-            tint[rows] *= texels.mean(1)
+            if material.picture:
+                tint[rows] *= material.picture.sample(u, v).mean(1)
+            if material.glow_picture:
+                glow[rows] *= material.glow_picture.sample(u, v)[..., :3].mean(1)
         if material.cut:
             tint[rows, 3] = tint[rows, 3] >= material.cut
         elif not material.see_through:
             tint[rows, 3] = 1
-    tint = np.clip(np.nan_to_num(tint), 0, 1)
+    tint, glow = np.clip(np.nan_to_num(tint), 0, 1), np.where(glow < _DARK, 0, glow)
     return tint[:, :3], tint[:, 3], np.clip(np.nan_to_num(glow), 0, 1e6), unlit
 
 
