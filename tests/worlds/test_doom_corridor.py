@@ -7,7 +7,7 @@ import torch
 
 import terrella
 from terrella.core import chance, check_world, make_rng
-from terrella.space.camera import planar_pose
+from terrella.space.camera import planar_pose, yaw
 from terrella.worlds.learned import LearnedWorld
 from terrella.worlds.objects import LOOK, NUMBER, PLACE
 
@@ -85,3 +85,20 @@ def test_a_guard_in_sight_does_something_and_the_place_stays_as_it_is(world):
         changed.append((float(off[there].mean()), float(off[~there].mean())))
     things, rest = torch.tensor(changed).unbind(1)
     assert (things > 4).sum() >= 2 and rest.mean() < 0.5 * things.mean()
+
+
+def test_shots_are_hits_and_fell_somebody_and_walking_is_neither(world):
+    for attacks in (True, False):
+        state, rng, hits, fallen = world.start(1, make_rng(0)), make_rng(0), 0, 0
+        for _ in range(60):
+            billboards = state["billboards"][0]
+            standing = billboards[world.objects.solid[billboards[:, LOOK].long().clamp_min(0)] > 0]
+            apart = standing[:, PLACE] - state["pose"][0, :3]
+            nearest = apart[apart[:, :2].norm(dim=1).argmin()]
+            turn = float(torch.atan2(nearest[1], nearest[0]) - yaw(state["pose"])[0])
+            action = torch.zeros(1, 7, dtype=torch.int8)
+            action[0, 0 if not attacks else 4 if turn > 0.06 else 5 if turn < -0.06 else 6] = 1
+            state = world.imagine(state, action, rng)
+            seen = world.render(state, ("hit", "fallen"))
+            hits, fallen = hits + int(seen["hit"]), fallen + int(seen["fallen"])
+        assert (hits >= fallen >= 1) if attacks else hits == fallen == 0

@@ -203,3 +203,38 @@ def test_ages_are_counted_to_a_limit():
     for _ in range(40):
         one = update_billboards(one, torch.zeros(1, 3), torch.tensor([float(RED)]))
     assert one[0, AGE] == one[0, RESTED] == 24
+
+
+def test_what_was_solid_and_never_is_again_has_fallen():
+    """Looks 0 and 1 stand and follow each other, 2 falls to 3; a corpse that may rise (0 after 3) is not down."""
+    objects = two_looks()
+    objects.solid[:] = torch.tensor([1.0, 1.0, 0.0, 0.0])
+    objects.follows[:] = False
+    for one, other in ((0, 1), (1, 0), (1, 2), (2, 3), (3, 3)):
+        objects.follows[one + 1, other] = True
+    assert objects.down.tolist() == [False, False, True, True]
+    objects.follows[4, 0] = True
+    assert not objects.down.any()
+
+
+def test_a_change_that_the_actions_caused_is_a_hit_and_another_is_not():
+    objects = two_looks()
+    objects.solid[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    objects.follows[:] = True
+    objects.think[0].weight.data.zero_()
+    objects.think[0].bias.data.zero_()
+    objects.think[0].weight.data[0, -1] = 50.0  # the newest aimed action alone is heard
+    for layer in (objects.think[3], objects.next_look):
+        layer.weight.data.zero_()
+        layer.bias.data.zero_()
+    objects.think[3].weight.data[0, 0], objects.next_look.weight.data[BLUE, 0] = 1.0, 1.0
+    objects.next_look.bias.data[RED] = 10.0
+    blue = torch.full((1, 4), float(BLUE))
+    before = billboards(objects, (4.0, 0.0, 0.0))
+    for act, hit in ((1.0, True), (0.0, False)):
+        acts = torch.zeros(1, 2, 3)
+        acts[0, -1, -1] = act
+        after = update_billboards(before, before[..., PLACE], blue)
+        state = State({"billboards_before": before, "billboards": after, "pose": viewer(), "actions": acts})
+        shown = objects.render(state, ("hit", "fallen"))
+        assert (bool(shown["hit"]), bool(shown["fallen"])) == (hit, False)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 # The spaces of channels that are the same in all worlds.
 REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 DONE = spaces.Box(0, 1, (), np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
+EVENT = DONE  # of a channel that says whether something happened in this step, such as "hit"
 POSE = spaces.Box(-np.inf, np.inf, (7,), np.float32)
 POSE_UNIT = "m, quaternion wxyz of T_world_cam"
 PLACES_UNIT = "x and y in m, heading in rad, kind"

@@ -5,6 +5,7 @@ only for nearer sprites. One metre is 32 map units. `things` masks everything th
 `objects` has the position of each sprite, `instances` its pixels."""
 
 import contextlib
+import math
 import os
 import re
 import tempfile
@@ -19,7 +20,7 @@ from gymnasium import spaces
 from PIL import Image
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Camera, Spec
+from ..core.spec import DONE, EVENT, POSE, POSE_UNIT, REWARD, Camera, Spec
 from ..core.state import State
 from .doom_map import Sectors, map_names, skies
 
@@ -49,6 +50,7 @@ PICK_UPS = ("Health", "Armor", "Ammo", "Weapon", "Powerup", "Key")
 SWITCHES = {"depth_buffer_enabled": True, "sectors_info_enabled": True, "audio_buffer_enabled": False}
 SWITCHES |= {"automap_buffer_enabled": False, "window_visible": False, "render_hud": False, "render_weapon": False}
 SWITCHES |= {"render_crosshair": False, "render_messages": False, "render_screen_flashes": False}
+_COUNTED = vizdoom.GameVariable.HITCOUNT, vizdoom.GameVariable.KILLCOUNT
 _BUFFER_SLOPE, _BUFFER_OFFSET = 0.1395, -1.8  # 8-bit level = floor(slope * map units + offset), fitted on my_way_home
 
 
@@ -73,7 +75,8 @@ class Doom:
 
     A scenario with the player's health has the channels `health`; `things` bool [h, w], the mask of sprites, doors and lifts;
     `objects` [OBJECTS, 4], the visible sprites, nearest first: a persistent number (0: none) and the position of its feet, metres;
-    and `instances` uint8 [h, w], the row of `objects` at each pixel, counted from 1. ATTACK and USE exist if its configuration has
+    `instances` uint8 [h, w], the row of `objects` at each pixel, counted from 1; and `hit` and `fallen`, whether the player hit or
+    felled something in this step. ATTACK and USE exist if its configuration has
     them. On a map of a game, a kill and the exit give reward 1, death -1, and episodes start at the map's start or at a
     pick-up."""
 
@@ -99,7 +102,7 @@ class Doom:
             channels["things"] = spaces.Box(0, 1, config.depth_size, np.bool_)  # pyright: ignore
             channels["instances"] = spaces.Box(0, OBJECTS, config.depth_size, np.uint8)
             channels["objects"] = spaces.Box(-np.inf, np.inf, (OBJECTS, 4), np.float32)
-            channels["health"] = HEALTH
+            channels |= {"health": HEALTH, "hit": EVENT, "fallen": EVENT}
         self.spec = Spec(
             name=f"doom:{config.scenario}",
             action=spaces.MultiBinary(len(self.buttons)),
@@ -130,7 +133,7 @@ class Doom:
         self._enter_map()
         if self._maps:
             self._start_at_pick_up(rng)
-        self._reward, self._done = 0.0, False
+        self._reward, self._done, self._counts = 0.0, False, [math.inf, math.inf]
         return self._advance()
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
@@ -186,6 +189,9 @@ class Doom:
 
     def _advance(self) -> State:
         self._ticket += 1
+        counts = [self._game.get_game_variable(variable) for variable in _COUNTED]
+        self._happened = dict(zip(("hit", "fallen"), (now > was for now, was in zip(counts, self._counts))))
+        self._counts = counts
         present = self._game.get_state()
         if present is not None:  # at the end of an episode the last picture stays
             self._present = present
@@ -202,6 +208,8 @@ class Doom:
             return torch.tensor(self._reward, dtype=torch.float32)
         if name == "done":
             return torch.tensor(self._done)
+        if name in self._happened:
+            return torch.tensor(self._happened[name])
         if name == "rgb":
             return torch.from_numpy(np.array(Image.fromarray(self._present.screen_buffer).reduce(self._shrink)))
         x, y, z, yaw_deg, health = (float(value) for value in np.asarray(self._present.game_variables))

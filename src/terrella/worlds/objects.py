@@ -15,6 +15,7 @@ from torch import nn
 
 from ..core import chance
 from ..core.errors import ObservationError
+from ..core.spec import EVENT
 from ..core.state import State
 from ..space.billboards import PICTURE, Cutout, cut_out, paint_billboards
 from ..space.camera import Intrinsics, yaw
@@ -35,6 +36,8 @@ STARTS = 32  # sets of billboards with which episodes begin
 AGES = 24  # steps are counted up to this
 WIDE_M = 0.65  # beside its middle, where a thing is aimed at by 1/e
 UNLIKELY = 0.01  # less likely looks are never sampled: over many steps they would fell a figure by chance
+CAUSED = 4.5  # log ratio of probabilities, under the actions and without them, from which a new look is due to them
+CHAIN = 24  # most looks of a movement, such as a fall
 FINE = (8, 6)  # rows and columns of the pictures that looks are compared by
 
 
@@ -100,7 +103,7 @@ class Billboards(nn.Module):
         rows = self.config.rows
         shows: dict[str, spaces.Space] = {"instances": spaces.Box(0, rows, size, np.uint8)}
         shows["objects"] = spaces.Box(-np.inf, np.inf, (rows, 4), np.float32)
-        return Channels(shows, may_observe=tuple(shows))
+        return Channels({**shows, "hit": EVENT, "fallen": EVENT}, may_observe=tuple(shows))
 
     def start(self, pick: torch.Tensor, state: State) -> Tensors:
         """The billboards of the starts `pick` [B], in place of the things in their pictures, which would never move."""
@@ -152,11 +155,41 @@ class Billboards(nn.Module):
         return DrawnFrame((rgb * 255).round().to(torch.uint8), depth, things, instances)
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
-        if "objects" not in channels:
-            return {}
-        return {"objects": state["billboards"][..., :4] * in_sight(state)[..., None]}
+        shown: Tensors = {}
+        if "objects" in channels:
+            shown["objects"] = state["billboards"][..., :4] * in_sight(state)[..., None]
+        if {"hit", "fallen"} & set(channels):
+            hit, fallen = self.struck(state)
+            shown |= {"hit": hit, "fallen": fallen}
+        return {name: shown[name] for name in channels if name in shown}
 
     # -- what happens -------------------------------------------------------------------------------------------------
+
+    def struck(self, state: State) -> tuple[torch.Tensor, torch.Tensor]:
+        """Whether the last step hit something, and whether something fell: bool [B] each. A hit is a change of look that the
+        actions caused, or a fall."""
+        before, after = state["billboards_before"], state["billboards"]
+        rows, look = after.shape[1], after[..., LOOK].long().clamp_min(0)
+        flat, pose, acts = (
+            before.flatten(0, 1),
+            *(state[name].repeat_interleave(rows, 0) for name in ("pose", "actions")),
+        )
+        logits = self.next_logits(flat.repeat(2, 1), pose.repeat(2, 1), torch.cat([acts, 0 * acts])).look
+        with_them, without = logits.log_softmax(1).chunk(2)
+        likelier = (with_them - without).gather(1, look.flatten()[:, None]).view(look.shape)
+        changed = (after[..., LOOK] != before[..., LOOK]) & (after[..., NUMBER] > 0) & (before[..., NUMBER] > 0)
+        down, stood = self.down, before[..., LOOK].long().clamp_min(0)
+        fell = (changed & down[look] & ~down[stood]).any(1)
+        return (changed & (likelier > CAUSED)).any(1) | fell, fell
+
+    @property
+    def down(self) -> torch.Tensor:
+        """bool [looks]: of a thing that was solid and never will be again, such as a figure that has fallen."""
+        follows, solid = self.follows[1:].float(), (self.solid > 0).float()
+        later = before = solid  # looks that follow a solid one, and looks that a solid one follows, within CHAIN steps
+        for _ in range(CHAIN):
+            later, before = (later + later @ follows).clamp_max(1.0), (before + follows @ before).clamp_max(1.0)
+        return (later > 0) & (before == 0)
 
     def next_logits(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
         """Of billboards [n, COLUMNS], seen from `pose` [n, 7] after the actions [n, history, A], the newest last."""

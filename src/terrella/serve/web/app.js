@@ -190,7 +190,7 @@ function able(button, why, title) {
 }
 
 /** How a number is called: events are counted. */
-function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) ? 's' : ''); }
+function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) && !/(n|ed)$/.test(name) ? 's' : ''); }
 
 /** The last picture of an episode, with how it ended, until the next begins. */
 function showEnding({ outcome, text, steps }) {
