@@ -15,6 +15,7 @@ from gymnasium.utils.passive_env_checker import check_action_space, check_observ
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 
+import terrella
 from terrella.core import Spec, State, WorldEnv, as_env, check_world, make_rng
 from terrella.core.errors import ActionError, ChannelError, TerrellaError
 from terrella.core.policy import Random
@@ -112,6 +113,147 @@ def test_the_seed_tells_the_story(cartpole):
     assert np.array_equal(first[0], as_env(cartpole, num_envs=2, seed=5).reset()[0])
     assert not np.array_equal(first[0, 0], first[0, 1])
     assert not np.array_equal(env.reset()[0], env.reset()[0])
+
+
+@pytest.mark.parametrize("forkable", [True, False])
+def test_each_environment_starts_by_its_own_seed(forkable):
+    world = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False, forkable=forkable))
+    try:
+        env = as_env(world, num_envs=3)
+        first = env.reset(seed=[3, 9, 4])[0]
+        assert np.array_equal(first, env.reset(seed=(3, 9, 4))[0]) and len(np.unique(first[:, 0])) == 3
+        assert np.array_equal(first[[2, 0, 1]], env.reset(seed=np.array([4, 3, 9]))[0])
+        assert np.array_equal(env.reset(seed=3)[0], env.reset(seed=[3, 4, 5])[0])
+        assert np.array_equal(env.reset(seed=[3, 4, 5])[0][:2], first[[0, 2]])
+        chance = [env.reset(seed=[3, None, 4])[0] for _ in range(2)]
+        assert np.array_equal(chance[0][[0, 2]], first[[0, 2]]) and not np.array_equal(chance[0][1], chance[1][1])
+        kept = env.reset(seed=[3, 9, 4])[0]
+        mask = np.array([False, True, True])
+        part = env.reset(seed=[7, 8, 3], options={"reset_mask": mask})[0]
+        assert np.array_equal(part[0], kept[0]) and np.array_equal(part[2], first[0])
+    finally:
+        world.close()
+    single = as_env(GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False, forkable=forkable)))
+    assert np.array_equal(single.reset(seed=[9])[0][0], first[1]) and np.array_equal(
+        single.reset(seed=9)[0][0], first[1]
+    )
+
+
+@pytest.mark.parametrize("seed", [[1], [1, 2, 3], [1, -2], -1, [0, 2**64]])
+def test_seeds_that_are_not_one_for_each_environment_are_refused(cartpole, seed):
+    with pytest.raises(TerrellaError, match="a list of one for each of 2 environments"):
+        as_env(cartpole, num_envs=2).reset(seed=seed)
+
+
+def test_what_happens_after_seeds_follows_from_them():
+    """Dice of the dynamics and of later starts, too."""
+    world = GymnasiumWorld("FrozenLake-v1", GymnasiumConfig(rgb=False))
+    actions = np.random.default_rng(0).integers(0, 4, (60, 2))
+    runs = []
+    for seed in ([3, 4], 3, [3, 5]):
+        env = as_env(world, num_envs=2)
+        env.reset(seed=seed)
+        runs.append(np.stack([env.step(action)[0] for action in actions]))
+    assert np.array_equal(runs[0], runs[1]) and not np.array_equal(runs[0], runs[2])
+
+
+def test_a_learned_world_starts_by_seeds_too():
+    env = as_env(terrella.load("doom-maze", memory=False), num_envs=3)
+    first = env.reset(seed=[1, 2, 1])[0]
+    assert first.shape[0] == 3 and np.array_equal(first[0], first[2]) and not np.array_equal(first[0], first[1])
+    assert np.array_equal(env.reset(seed=[2, 1, 7])[0][1], first[0])
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_it_is_as_gymnasiums_own_vector_environment(mode):
+    """The same calls on SyncVectorEnv give the same types, shapes and infos at the same steps."""
+    make = lambda: gymnasium.make("CartPole-v1", max_episode_steps=9)  # noqa: E731
+    own = gymnasium.vector.SyncVectorEnv([make] * 2, autoreset_mode=mode)
+    env = as_env(GymnasiumWorld(make, GymnasiumConfig(rgb=False)), num_envs=2, autoreset_mode=mode)
+    assert (env.observation_space, env.action_space) == (own.observation_space, own.action_space)
+    assert (env.single_observation_space, env.single_action_space) == (
+        own.single_observation_space,
+        own.single_action_space,
+    )
+    assert (
+        env.metadata["autoreset_mode"] == own.metadata["autoreset_mode"] and env.unwrapped is env and env.spec is None
+    )
+    assert alike(env.reset(seed=[1, 2]), own.reset(seed=[1, 2]))
+    for step in range(24):
+        mine, theirs = (each.step(np.array([step % 2, 1 - step % 2])) for each in (env, own))
+        assert alike(mine, theirs), (step, mine, theirs)
+        if mode is AutoresetMode.DISABLED and (ended := mine[2] | mine[3]).any():
+            assert alike(*(each.reset(seed=[None, 5], options={"reset_mask": ended.copy()}) for each in (env, own)))
+    for each in (env, own):
+        assert each.get_attr("render_mode") == each.call("render_mode") == (None, None)
+        each.close(terminate=True)
+        assert each.closed
+        each.close()
+    with pytest.raises(TerrellaError, match="closed"):
+        env.step(np.array([0, 0]))
+
+
+def alike(one, other) -> bool:
+    """Whether both have the same types, dtypes, shapes, keys, and, where they are booleans, values."""
+    if isinstance(one, dict):
+        return isinstance(other, dict) and set(one) == set(other) and all(alike(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, np.ndarray) and one.dtype == object:
+        return other.dtype == object and all(map(alike, one, other))
+    if isinstance(one, np.ndarray):
+        same = one.dtype != bool or np.array_equal(one, other)
+        return isinstance(other, np.ndarray) and (one.dtype, one.shape) == (other.dtype, other.shape) and same
+    return type(one) is type(other)
+
+
+NEXT_STEP, SAME_STEP = AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP
+
+
+@pytest.mark.parametrize(
+    ("mode", "wrap"),
+    [
+        (NEXT_STEP, wrappers.DictInfoToList),
+        (SAME_STEP, wrappers.DictInfoToList),
+        (NEXT_STEP, wrappers.FlattenObservation),  # wrappers of observations take no other mode
+        (SAME_STEP, lambda env: wrappers.TransformReward(env, lambda reward: reward * 2)),
+        (SAME_STEP, lambda env: wrappers.TransformAction(env, lambda action: action)),
+    ],
+)
+def test_each_kind_of_gymnasiums_wrappers_goes_on_over_ends(cartpole, mode, wrap):
+    env = wrap(wrappers.RecordEpisodeStatistics(as_env(cartpole, num_envs=2, max_steps=6, autoreset_mode=mode)))
+    env.reset(seed=[0, 1])
+    ends = 0
+    for step in range(20):
+        actions = np.array([step % 2, 1])
+        *_, terminated, truncated, infos = env.step(actions)
+        ends += int((np.asarray(terminated) | np.asarray(truncated)).sum())
+    assert ends >= 4
+    env.close()
+
+
+def test_actions_of_any_kind_of_array_are_taken(cartpole):
+    env = as_env(cartpole, num_envs=2)
+    fixed = np.array([0, 1])
+    fixed.flags.writeable = False
+    seen = []
+    for actions in ([0, 1], (0, 1), fixed, np.array([0, 1], np.int32), torch.tensor([0, 1])):
+        env.reset(seed=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            seen.append(env.step(actions)[0])
+    assert all(np.array_equal(seen[0], one) for one in seen)
+
+
+def test_a_world_without_observation_or_pictures_shows_all_its_channels():
+    env = as_env(GymnasiumWorld("Blackjack-v1", GymnasiumConfig(rgb=False)))
+    seen, _ = env.reset(seed=0)
+    assert set(seen) == {"observation.0", "observation.1", "observation.2"} and seen in env.observation_space
+
+
+def test_options_that_it_does_not_have_are_named(cartpole):
+    with pytest.warns(UserWarning, match="no options level; they are ignored"):
+        as_env(cartpole).reset(seed=0, options={"level": 3})
 
 
 def test_next_step_autoreset_spends_a_step_on_the_new_start(film):

@@ -18,6 +18,7 @@ from terrella.core.spec import POSE, POSE_UNIT
 from terrella.sim.environment_loading import use_tracking_camera
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumConfig, GymnasiumWorld
 
+GRAPH = spaces.Sequence(spaces.Discrete(2))
 COPYABLE = ("CartPole-v1", "Pendulum-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Acrobot-v1")
 
 
@@ -338,7 +339,9 @@ def test_bad_requests_are_answered_in_one_sentence():
     with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
         GymnasiumWorld("CartPole-v1", GymnasiumConfig(options={"no_such_option": 1}))
     with pytest.raises(TerrellaError, match="FlattenObservation"):
-        GymnasiumWorld("Blackjack-v1", GymnasiumConfig(rgb=False))
+        GymnasiumWorld(
+            lambda: gymnasium.wrappers.TransformObservation(gymnasium.make("CartPole-v1"), lambda seen: (1,), GRAPH)
+        )
     world, rng = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)), make_rng(0)
     state = world.start(1, rng)
     with pytest.raises(ActionError):

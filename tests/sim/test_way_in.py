@@ -84,7 +84,7 @@ def test_pictures_of_any_form_and_the_parts_of_a_dictionary_are_seen():
         state = world.imagine(world.start(1, rng), torch.tensor([0]), rng)
         rgb = world.render(state, ("rgb",))["rgb"]
         assert rgb.shape == (1, 16, 20, 3) and (rgb == brightness).all()
-    assert set(world.spec.channels) == {"rgb", "speed", "reward", "done"}
+    assert set(world.spec.channels) == {"rgb", "speed", "reward", "done", "text", "instruction"}
     assert world.render(state, ("speed",))["speed"].tolist() == [[1, 1]]
 
 

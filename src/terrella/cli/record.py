@@ -1,6 +1,7 @@
 """The commands `terrella record ...`."""
 
 from ..workflows.collect import CollectConfig, DoomRecordConfig, collect, collect_doom
+from ..workflows.recording_facts import describe as described  # noqa: F401  its former name and place
 from .say import Json, WorldName, say, show
 
 

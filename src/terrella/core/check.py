@@ -18,7 +18,7 @@ from .world import Observation, World, make_rng
 _WELL_KNOWN = {
     "rgb": (np.uint8, 3), "depth": (np.float32, 2), "pose": (np.float32, 1), "reward": (np.float32, 0),
     "done": (np.bool_, 0), "known": (np.float32, 2), "places": (np.float32, 2), "mosaic": (np.uint8, 3),
-    "instruction": (np.float32, 1),
+    "text": (np.uint8, 1), "instruction": (np.float32, 1),
 }  # fmt: skip
 
 

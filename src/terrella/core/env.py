@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from gymnasium import spaces
+from gymnasium import logger, spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -19,7 +19,7 @@ class WorldEnv(VectorEnv):
     max_steps:      steps after which an episode is truncated; None takes the world's limit (Spec.max_episode_steps),
                     math.inf sets none.
     observation:    one channel, whose arrays are the observations, or several, for a dictionary of arrays. None takes
-                    "observation" where the world has it, else "rgb".
+                    "observation" where the world has it, else "rgb", else all channels but reward and done.
     seed:           of the first `reset()`; later resets without a seed continue its random numbers.
     autoreset_mode: as in Gymnasium. NEXT_STEP: the step after an end starts a new episode and ignores its action.
                     SAME_STEP: the last observation is infos["final_obs"], its infos are infos["final_info"].
@@ -47,7 +47,8 @@ class WorldEnv(VectorEnv):
         if not max_steps >= 1:
             raise TerrellaError(f"max_steps is a number of steps from 1 on, or math.inf for no end; got {max_steps}.")
         if observation is None:
-            observation = "observation" if "observation" in spec.channels else "rgb"
+            rest = tuple(name for name in spec.channels if name not in ("reward", "done"))
+            observation = next((name for name in ("observation", "rgb") if name in rest), rest)
         self._single = isinstance(observation, str)
         self._names = (observation,) if isinstance(observation, str) else tuple(observation)
         spec.check_channels(self._names)
@@ -66,7 +67,7 @@ class WorldEnv(VectorEnv):
             "render_fps": max(1, round(1 / spec.dt_s)),
             "autoreset_mode": self.autoreset_mode,
         }
-        self._rng = make_rng(seed)
+        self._rng, self._first_seed = make_rng(seed), seed
         self._state: State | None = None
         self._steps = np.zeros(num_envs, np.int64)
         self._ended = np.zeros(num_envs, np.bool_)
@@ -74,27 +75,54 @@ class WorldEnv(VectorEnv):
     @property
     def state(self) -> State:
         """The state of the world; batch entry i is environment i."""
+        if self.closed:
+            raise TerrellaError("the environment is closed: make another with as_env(world).")
         if self._state is None:
             raise TerrellaError("the environment has not begun: call reset() first.")
         return self._state
 
     @torch.no_grad()
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Starts new episodes in all environments, or in those of options["reset_mask"]; `seed` seeds all randomness again."""
-        super().reset(seed=seed)
-        if seed is not None:
-            self._rng = make_rng(seed)
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, np.bool_))
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None):
+        """Starts new episodes in all environments, or in those of options["reset_mask"], a bool array [num_envs].
+
+        seed: one for each environment, None for chance; the number n stands for n, n + 1, ... The start of an environment
+              depends on its own seed alone. A reset of all environments with a seed for each seeds all later randomness, too.
+        """
+        rest = dict(options or {})
+        mask = rest.pop("reset_mask", np.ones(self.num_envs, np.bool_))
         valid = isinstance(mask, np.ndarray) and mask.shape == (self.num_envs,) and mask.dtype == np.bool_
         if not valid or not mask.any():
             raise TerrellaError(f"options['reset_mask'] is a numpy array of {self.num_envs} booleans, not all False.")
-        self._restart(None if mask.all() else self.state, mask)
+        if rest:
+            logger.warn(f"{self.world.spec.name} has no options {', '.join(map(str, rest))}; they are ignored.")
+        before = None if mask.all() else self.state
+        if before is None and self._state is None and seed is None:
+            seed = self._first_seed
+        seeds = self._seeds(seed)
+        given = [one for one in seeds if one is not None]
+        if before is None and len(given) == self.num_envs:
+            super().reset(seed=given[0])
+            self._rng = make_rng(int(np.random.SeedSequence(given).generate_state(1, np.uint64)[0] >> 1))
+        self._restart(before, mask, seeds)
         return self._observations(self._look()), {}
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """A seed, or None, for each environment."""
+        if seed is None or isinstance(seed, int | np.integer):
+            seeds = [None if seed is None else int(seed) + place for place in range(self.num_envs)]
+        else:
+            seeds = [None if one is None else int(one) for one in seed]
+        if len(seeds) != self.num_envs or any(one is not None and not 0 <= one < 2**63 for one in seeds):
+            raise TerrellaError(
+                f"seed is a number from 0 on, or a list of one for each of {self.num_envs} environments; got {seed}."
+            )
+        return seeds
 
     @torch.no_grad()
     def step(self, actions):
         """Observations, rewards (float64), terminated, truncated, infos; arrays lead with num_envs."""
-        state, actions = self.state, torch.as_tensor(np.asarray(actions))
+        state = self.state
+        actions = actions if isinstance(actions, torch.Tensor) else torch.from_numpy(np.array(actions))
         fresh = self._ended.copy()
         if fresh.any() and self.autoreset_mode == AutoresetMode.DISABLED:
             raise TerrellaError(f"environments {np.flatnonzero(fresh).tolist()} have ended: reset them first.")
@@ -126,10 +154,37 @@ class WorldEnv(VectorEnv):
             return None
         return tuple(np.array(frame) for frame in self.world.render(self.state, ("rgb",))["rgb"].cpu().numpy())
 
-    def _restart(self, state: State | None, mask: np.ndarray) -> None:
+    def get_attr(self, name: str) -> tuple:
+        """An attribute of the environments, once for each, as SyncVectorEnv has it."""
+        return (getattr(self, name),) * self.num_envs
+
+    def set_attr(self, name: str, values) -> None:
+        """Sets an attribute of all environments; a list is one value for each, which must be alike."""
+        several = values if isinstance(values, list | tuple) else [values]
+        if any(one != several[0] for one in several):
+            raise TerrellaError(f"the environments of a world share '{name}': give one value.")
+        setattr(self, name, several[0])
+
+    def call(self, name: str, *args, **kwargs) -> tuple:
+        """The pictures of `render`, or an attribute, once for each environment, as SyncVectorEnv has it."""
+        value = getattr(self, name)
+        return value(*args, **kwargs) if name == "render" else self.get_attr(name)
+
+    def close_extras(self, **kwargs) -> None:
+        """Forgets the episodes; the world stays open."""
+        self._state = None
+
+    def _restart(self, state: State | None, mask: np.ndarray, seeds: Sequence[int | None] = ()) -> None:
         """Replaces the entries `mask` of `state` by new episodes; `state` may be None where the mask is all True."""
-        fresh = self.world.start(int(mask.sum()), self._rng)
-        self._state = fresh if mask.all() else state.put(torch.from_numpy(np.flatnonzero(mask)), fresh)
+        places = np.flatnonzero(mask)
+        seeded = {at: seed for at, place in enumerate(places.tolist()) if seeds and (seed := seeds[place]) is not None}
+        if len(seeded) == len(places) and (self.world.spec.forkable or self.num_envs == 1):
+            fresh = State.stack([self.world.start(1, make_rng(seed)) for seed in seeded.values()])
+        else:
+            fresh = self.world.start(len(places), self._rng)
+            for at, seed in seeded.items():
+                fresh = fresh.put(torch.tensor([at]), self.world.start(1, make_rng(seed)))
+        self._state = fresh if mask.all() else state.put(torch.from_numpy(places), fresh)
         self._steps[mask], self._ended[mask] = 0, False
 
     def _look(self) -> dict[str, np.ndarray]:

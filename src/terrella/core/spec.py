@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from .errors import ActionError, ChannelError
+from .instruction import INSTRUCTION_SIZE, TEXT_BYTES
 
 if TYPE_CHECKING:
     import torch
@@ -20,6 +21,8 @@ REWARD = spaces.Box(-np.inf, np.inf, (), np.float32)
 DONE = spaces.Box(0, 1, (), np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
 EVENT = DONE  # of a channel that says whether something happened in this step, such as "hit"
 POSE = spaces.Box(-np.inf, np.inf, (7,), np.float32)
+TEXT = spaces.Box(0, 255, (TEXT_BYTES,), np.uint8)
+INSTRUCTION = spaces.Box(-1, 1, (INSTRUCTION_SIZE,), np.float32)
 POSE_UNIT = "m, quaternion wxyz of T_world_cam"
 PLACES_UNIT = "x and y in m, heading in rad, kind"
 WALKABLE = 4  # kind in the channel `places`: somewhere to stand (core/world.py)

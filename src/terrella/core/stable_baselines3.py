@@ -40,7 +40,7 @@ class WorldVecEnv(VecEnv):
         super().__init__(num_envs, seen, spaces.Discrete(action.n) if isinstance(action, spaces.Discrete) else action)
 
     def reset(self):
-        seen, _ = self.env.reset(seed=self._seeds[0])
+        seen, _ = self.env.reset(seed=None if None in self._seeds else self._seeds)
         self._reset_seeds()
         return _map(_arranged, seen)
 

@@ -20,7 +20,8 @@ from .state import State
 #                observed, 3 imagined; 4 a place where one can stand
 #   mosaic       uint8 [B, H', W', 4], red, green, blue and 255 (0 where nothing was seen): the pictures so far, stitched by
 #                their scrolling, with rgb in the middle
-#   instruction  float32 [B, D], the embedding of a task's text
+#   text         uint8 [B, 1024], the text of the task in UTF-8, padded with zeros (core/instruction.py)
+#   instruction  float32 [B, D], the embedding of that text
 # A goal is such a mapping, too.
 Observation = Mapping[str, torch.Tensor]
 

@@ -14,9 +14,11 @@ from .source import Sensor
 RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
 ACTION, REWARD, DONE = "action", "next.reward", "next.done"
 POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-NAME = re.compile(r"\w[\w.-]{0,200}")  # valid name of a feature, which also names files and folders
+MOST_LETTERS = 200
+NAME = re.compile(rf"\w[\w.-]{{0,{MOST_LETTERS}}}")  # valid name of a feature, which also names files and folders
 MOST_AXES = 5
 ESTIMATES = ("uncertainty", "known", "places", "keyframes", "hit", "fallen")  # of a learned world, so no training data
+OF_TASK = ("text", "instruction")  # channels that an episode's task holds
 RENAMED = {"cast": "objects"}  # channel of old recordings -> its name now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}
 _IMAGES = "observation.images."
@@ -51,14 +53,13 @@ def current_feature(feature: str) -> str:
 
 
 def features_of(channels: Iterable[str]) -> dict[str, str]:
-    """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose. DatasetError where
-    two channels would share a feature, or a name is not a valid feature name."""
+    """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose. Letters that no
+    file name may have become "_": "arm/pos" is observation.arm_pos. DatasetError where two channels would share a feature."""
     features: dict[str, str] = {}
     channels = list(channels)
     for channel in channels:
         feature = POSE if channel == "pose" and "state" in channels else feature_of(channel)
-        if not NAME.fullmatch(feature):
-            raise DatasetError(f"the channel '{channel[:100]}' is no file name; use letters, digits, '.', '_' and '-'.")
+        feature = re.sub(r"[^\w.-]", "_", feature)[:MOST_LETTERS]
         for other, taken in features.items():
             if taken.lower() == feature.lower():
                 raise DatasetError(f"the channels '{other}' and '{channel}' would both be {feature}; rename one.")
@@ -67,9 +68,10 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
 
 
 def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
-    """channel -> Sensor, for all recorded channels of a world; DatasetError for a channel that cannot be recorded."""
-    features = features_of(spec.recorded)
-    return {name: _sensor(spec, name, spec.channels[name], features[name]) for name in spec.recorded}
+    """channel -> Sensor, for all recorded channels of a world but those that its tasks hold; DatasetError for a channel that cannot
+    be recorded."""
+    features = features_of(name for name in spec.recorded if "text" not in spec.channels or name not in OF_TASK)
+    return {name: _sensor(spec, name, spec.channels[name], feature) for name, feature in features.items()}
 
 
 def _sensor(spec: Spec, channel: str, space: spaces.Space, feature: str) -> Sensor:
@@ -123,9 +125,15 @@ def facts_of(spec: Spec) -> dict[str, object]:
         "action_mode": spec.action_mode, "action_frame": spec.action_frame,
         "keys": {key: [float(number) for number in value] for key, value in spec.keys.items()},
         "idle": [float(number) for number in spec.idle], "max_episode_steps": spec.max_episode_steps,
+        "left_out": dict(_mapping(spec, "left_out")), "renamed": dict(_mapping(spec, "renamed")),
         "units": dict(spec.units), "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
         **limits,
     }  # fmt: skip
+
+
+def _mapping(spec: Spec, name: str) -> Mapping:
+    kept = spec.card.get(name)
+    return kept if isinstance(kept, Mapping) else {}
 
 
 def _camera_json(camera: Camera) -> dict[str, object]:

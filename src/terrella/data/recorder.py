@@ -16,8 +16,9 @@ import pyarrow as pa
 
 from ..core.errors import DatasetError
 from ..core.files import FULL, remedy_of
+from ..core.instruction import bytes_to_text
 from . import stats
-from .channels import ACTION, DONE, REWARD, feature_of
+from .channels import ACTION, DONE, OF_TASK, REWARD, feature_of
 from .features import unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, TIME, Layout, even_size
 from .source import Sensor, is_action, is_outcome
@@ -105,7 +106,12 @@ class Recorder:
         time_s: float | None = None,
     ) -> None:
         """Adds one row; the observation has no batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...). `action` is
-        None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`."""
+        None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`. The channel `text` becomes
+        the instruction from this row on."""
+        if "text" in observation and "text" not in self.layout.channels:
+            if (text := bytes_to_text(observation["text"])) != self._text:
+                self.say(text)
+            observation = {name: value for name, value in observation.items() if name not in OF_TASK}
         row = {self.layout.channels.get(name) or feature_of(name): value for name, value in observation.items()}
         unknown = sorted(name for name in row if name not in self.layout.sensors)
         if unknown:
@@ -164,6 +170,7 @@ class Recorder:
         self._check_open()
         with self._nothing_lost():
             self._begin().add(WORDS, 0.0, task.encode())
+        self._text = task
 
     def end_episode(self, start_ns: int | None = None) -> int | None:
         """Commits the episode in flight and returns its number; an episode of fewer than 2 rows is dropped and gives None.
@@ -369,6 +376,7 @@ class Recorder:
         self._pictures: dict[str, list[stats.Summary]] = {}
         self._newest: dict[str, float] = {}
         self._before: dict[str, np.ndarray] = {}
+        self._text = self.task
 
     def _discard(self) -> None:
         """Drops the episode in flight and its files."""

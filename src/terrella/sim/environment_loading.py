@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from ..core.errors import TerrellaError
 from . import islet  # noqa: F401  it registers Islet-v0
+from .drawn_pictures import DrawnPictures
 
 _DISPLAY = re.compile(r"display|video device|gl context|\b(glfw|opengl|egl|osmesa|x11|glx|xlib)\b")
 
@@ -101,19 +101,21 @@ def _ended(error: Exception) -> str:
     return first if first.endswith("?") else f"{first}."
 
 
-def picture_size(env: gymnasium.Env, name: str) -> tuple[int, int] | None:
-    """(height, width) of the picture of an environment after a reset, or None."""
+def first_picture(env: gymnasium.Env, name: str, pictures: DrawnPictures) -> tuple[tuple[int, int] | None, str]:
+    """((height, width) of the picture of an environment after a reset or None, why there is none)."""
     if env.render_mode != "rgb_array":
-        return None
+        return None, ""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would mix with our output
     with explained(name, "drawn"):
         try:
-            picture = env.render()
-        except gymnasium.error.DependencyNotInstalled:
-            return None
-    if not isinstance(picture, np.ndarray) or picture.ndim != 3 or picture.shape[2] != 3:
-        return None
-    return picture.shape[0], picture.shape[1]
+            drawn = env.render()
+        except gymnasium.error.DependencyNotInstalled as error:
+            return None, _ended(error).rstrip(".")
+    try:
+        height, width = pictures.read(drawn).shape[:2]
+    except TerrellaError as error:
+        return None, str(error)
+    return (height, width), ""
 
 
 def load_adapter(source: str) -> Any:

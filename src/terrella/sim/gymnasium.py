@@ -14,12 +14,15 @@ import torch
 from gymnasium import spaces
 
 from ..core.errors import ObservationError, StaleStateError, TerrellaError
-from ..core.spec import DONE, REWARD, Camera, Spec, kind_of
+from ..core.instruction import embed, text_to_bytes
+from ..core.numbers import single_number
+from ..core.spec import DONE, INSTRUCTION, REWARD, TEXT, Camera, Spec, kind_of
 from ..core.state import State
 from ..core.world import make_rng
+from .drawn_pictures import DrawnPictures
 from .environment_facts import EnvironmentFacts, facts_of
-from .environment_loading import build, explained, picture_size
-from .observation_channels import check_space, parts_of, resized, space_of, value_at
+from .environment_loading import build, explained, first_picture
+from .observation_channels import check_space, entry_at, label_of, parts_of, resized, space_of, value_at
 from .processes import MAX_EPISODES, Processes
 from .snapshot import NotCopyable, Snapshots
 
@@ -69,8 +72,9 @@ class Adapter:
 class GymnasiumConfig:
     """The settings of a GymnasiumWorld."""
 
-    # Show `rgb`, if the environment renders with render_mode="rgb_array". An observation that is a picture (uint8 or floats up to
-    # 1; [H, W, 3], [3, H, W] or grey) is shown as `rgb` instead of `observation`.
+    # Show `rgb`, if the environment renders with render_mode="rgb_array", in any form that sim/drawn_pictures.py reads. An
+    # observation that is a picture (uint8 or floats up to 1 or 255; [H, W, 3], [3, H, W] or grey) is shown as `rgb` instead of
+    # `observation`.
     rgb: bool = True
     # (height, width) to which rgb is area-averaged; None for its own size.
     size: tuple[int, int] | None = None
@@ -81,7 +85,7 @@ class GymnasiumConfig:
     forkable: bool | None = None
     # How states are copied. Default: sim/snapshot.py.
     snapshots: Callable[[gymnasium.Env], Any] | None = None
-    # Seconds per step. Default: the environment's `dt` or `tau`, else from its frame rate, else 0.1.
+    # Seconds per step. Default: what the environment says of it (core/step_length.py), else 0.1.
     dt_s: float | None = None
     # Name for the spec. Default: the environment's.
     name: str = ""
@@ -104,12 +108,20 @@ class GymnasiumWorld:
     """`GymnasiumWorld("CartPole-v1")`. env: an id, made without its time limit (which becomes Spec.max_episode_steps, kept by
     `as_env`), or a function that returns a new environment at each call.
 
-    Channels: observation [B, *shape] (each array of a Dict is its own channel), reward float32 [B], done bool [B] (terminated, or
-    truncated by the environment, see `truncated` in the state), rgb uint8 [B, H, W, 3]. After `done` the world stands still with
-    reward 0. `start` uses `rng`, and so does each `imagine` if the world is forkable. spec.card["how"] says where facts about the
-    environment come from. TerrellaError where the environment cannot be found, made, reset or rendered, and for Tuple spaces."""
+    Channels: observation [B, *shape] (each array in nested Dicts and Tuples is its own channel), reward float32 [B], done bool [B]
+    (terminated, or truncated by the environment, see `truncated` in the state), rgb uint8 [B, H, W, 3]; of an observation with a
+    text, such as a mission, text and instruction (core/world.py). After `done` the world stands still with reward 0. `start` uses
+    `rng`, and so does each `imagine` if the world is forkable. spec.card["how"] says where facts about the environment come
+    from, spec.card["left_out"] what is in no channel and why. `settings` are fields of the config. TerrellaError where the
+    environment cannot be found, made, reset or rendered, and where nothing of its observation is an array."""
 
-    def __init__(self, env: str | Callable[[], gymnasium.Env], config: GymnasiumConfig = GymnasiumConfig()):
+    def __init__(
+        self,
+        env: str | Callable[[], gymnasium.Env],
+        config: GymnasiumConfig = GymnasiumConfig(),
+        **settings: Any,
+    ):
+        config = replace(config, **settings)
         self._lock = threading.Lock()  # all episodes share one environment, so only one may step at a time
         rgb, options, repeat = config.rgb, dict(config.options), config.repeat
         self._env, own_name = build(env, rgb, options)
@@ -118,9 +130,11 @@ class GymnasiumWorld:
         self._size, self._info = check_size(config.size), tuple(config.info_channels)
         check_space(self._env.action_space, self._name)
         renders = rgb and self._env.render_mode == "rgb_array"
-        self._parts = parts_of(self._env.observation_space, self._name, rgb, renders)
         with explained(self._name, "reset"):
-            self._env.reset(seed=0)
+            seen, info = self._env.reset(seed=0)
+        self._parts = parts_of(self._env.observation_space, seen, rgb, renders, self._info)
+        if not self._parts.arrays and not renders:
+            check_space(self._env.observation_space, self._name)
         self._snapshots, self._viewer = None, self._env
         if config.forkable is not False:
             self._try_forking(build(env, rgb, options)[0], config.snapshots or Snapshots, bool(config.forkable))
@@ -133,8 +147,11 @@ class GymnasiumWorld:
         channels = {at: self._with_space(at, channel, info) for at, channel in adapter.channels.items()}
         self._adapter = replace(adapter, channels=channels)
         self._info_paths = {at: one.read for at, one in channels.items() if str(one.read).startswith("info.")}
-        self._rgb_size = self._picture_size(seen, rgb)
-        self.spec = self._describe(facts_of(self._env, adapter.action_names), config.dt_s)
+        self._drawn = DrawnPictures()
+        self._rgb_size, why = self._picture_size(seen) if rgb else (None, "")
+        left_out = self._parts.left_out | ({"pictures": why} if why else {})
+        left_out |= {f"info.{key}": "no channel reads it" for key in info if key not in self._used_infos()}
+        self.spec = self._describe(facts_of(self._env, adapter.action_names), config.dt_s, left_out)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
@@ -172,10 +189,11 @@ class GymnasiumWorld:
     def step(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Steps the environment `repeat` times or until the episode ends; returns its channels."""
         with explained(self._name, "stepped"):
-            total = 0.0
+            total, terminated, truncated = 0.0, False, False
             for _ in range(self._repeat):
-                seen, reward, terminated, truncated, info = self._env.step(action)
-                total += float(reward)
+                seen, reward, *ends, info = self._env.step(action)
+                total += single_number(reward, f"the reward of {self._name}")
+                terminated, truncated = (bool(single_number(end, f"the end of {self._name}")) for end in ends)
                 if terminated or truncated:
                     break
             return self._row(seen, total, terminated, truncated, info)
@@ -223,14 +241,17 @@ class GymnasiumWorld:
             self._processes.close()
 
     def _row(self, observation, reward, terminated, truncated, info: Mapping) -> dict[str, np.ndarray]:
-        row: dict[str, Any] = {name: part.read(observation, self._name) for name, part in self._parts.items()}
+        row: dict[str, Any] = {name: part.read(observation, self._name) for name, part in self._parts.arrays.items()}
         if "rgb" in row:
             row["rgb"] = self._sized(row["rgb"])
+        if self._parts.text is not None:
+            text = str(entry_at(observation, self._parts.text, self._name))
+            row |= {"text": text_to_bytes(text), "instruction": embed(text)}
         row |= {
             "reward": np.float32(reward),
             "done": np.bool_(terminated or truncated),
             "truncated": np.bool_(truncated and not terminated),
-            **{name: np.float32(info[name]) for name in self._info},
+            **{name: np.float32(single_number(info[name], f"info['{name}'] of {self._name}")) for name in self._info},
             **{name: self._fitting(name, value_at(None, info, str(path))) for name, path in self._info_paths.items()},
         }
         if self._snapshots is not None:
@@ -276,7 +297,7 @@ class GymnasiumWorld:
         channel, bare = self._adapter.channels.get(name), self._viewer.unwrapped
         with explained(self._name, "drawn" if channel is None else f"asked for its {name}"):
             if channel is None:
-                return self._fitting(name, self._sized(np.asarray(self._viewer.render())))
+                return self._fitting(name, self._sized(self._drawn.read(self._viewer.render())))
             read = channel.read
             return self._fitting(name, value_at(bare, {}, read) if isinstance(read, str) else read(bare))
 
@@ -306,16 +327,22 @@ class GymnasiumWorld:
         except TerrellaError as error:
             raise TerrellaError(f"the channel '{name}' of {self._name} cannot be read: {error}") from error
 
-    def _picture_size(self, observation: Any, rgb: bool) -> tuple[int, int] | None:
-        """(height, width) of the pictures before resizing; None without pictures."""
-        if "rgb" in self._parts:
-            height, width = self._parts["rgb"].read(observation, self._name).shape[:2]
-            return height, width
-        return picture_size(self._viewer, self._name) if rgb else None
+    def _picture_size(self, observation: Any) -> tuple[tuple[int, int] | None, str]:
+        """((height, width) of the pictures before resizing or None without pictures, why there are none)."""
+        if "rgb" in self._parts.arrays:
+            height, width = self._parts.arrays["rgb"].read(observation, self._name).shape[:2]
+            return (height, width), ""
+        return first_picture(self._viewer, self._name, self._drawn)
 
-    def _describe(self, facts: EnvironmentFacts, dt_s: float | None) -> Spec:
-        channels = {name: part.space for name, part in self._parts.items() if name != "rgb"}
+    def _used_infos(self) -> set[str]:
+        """The keys of `info` that are read."""
+        return {*self._info, *(str(path).split(".")[1] for path in self._info_paths.values())}
+
+    def _describe(self, facts: EnvironmentFacts, dt_s: float | None, left_out: Mapping[str, str]) -> Spec:
+        channels = {name: part.space for name, part in self._parts.arrays.items() if name != "rgb"}
         channels |= {"reward": REWARD, "done": DONE}
+        if self._parts.text is not None:
+            channels |= {"text": TEXT, "instruction": INSTRUCTION}
         channels |= {name: spaces.Box(-np.inf, np.inf, (), np.float32) for name in self._info}
         if self._rgb_size is not None:
             channels["rgb"] = spaces.Box(0, 255, (*(self._size or self._rgb_size), 3), np.uint8)
@@ -324,6 +351,15 @@ class GymnasiumWorld:
         adapter = self._adapter
         channels |= {at: channel.space for at, channel in adapter.channels.items() if channel.space is not None}
         what = f"the Gymnasium environment {self._name.removeprefix('gym:')}"
+        how = {**facts.how, **({"pictures": self._drawn.form} if self._drawn.form else {})}
+        how |= {"task": f"the text '{label_of(self._parts.text)}'"} if self._parts.text is not None else {}
+        card = {
+            "what": what,
+            "kind": "simulator",
+            "how": how,
+            "renamed": self._parts.renamed,
+            "left_out": dict(left_out),
+        }
         return Spec(
             name=self._name,
             action=self._env.action_space,
@@ -339,7 +375,7 @@ class GymnasiumWorld:
             keys=adapter.keys if adapter.keys is not None else facts.keys,
             forkable=self._snapshots is not None,
             max_batch=None if self._snapshots is not None else MAX_EPISODES,
-            card={"what": what, "kind": "simulator", "how": facts.how},
+            card=card,
             idle=tuple(adapter.idle),
         )
 
@@ -389,6 +425,8 @@ def _bytes(seen: Any) -> Any:
     """An observation in a form that can be compared."""
     if isinstance(seen, Mapping):
         return [(key, _bytes(value)) for key, value in seen.items()]
+    if isinstance(seen, tuple):
+        return [_bytes(value) for value in seen]
     return np.asarray(seen).tobytes()
 
 

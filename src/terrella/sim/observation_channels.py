@@ -1,8 +1,9 @@
-"""The channels in the observations of a Gymnasium environment: pictures of any layout, and entries of a Dict."""
+"""The channels in the observations of a Gymnasium environment: pictures of any layout, entries of Dicts and Tuples, a text."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -10,27 +11,34 @@ from gymnasium import spaces
 from PIL import Image
 
 from ..core.errors import TerrellaError
+from ..core.instruction import TASK_NAMES
+from ..core.spec import kind_of
 
 _KNOWN_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 _PIXELS = 16  # smallest side of a picture
-# Number of axes that a channel of this name must have; -1: not allowed in observations.
-_AXES = {"depth": 2, "reward": -1, "done": -1}
+# Channels that mean something else than an array of the observation, and those of which it must have this form.
+_RESERVED = (
+    "rgb", "reward", "done", "truncated", "numbers", "kinds", "ticket", "text", "instruction", "known", "places",
+    "keyframes", "mosaic", "uncertainty", "hit", "fallen",
+)  # fmt: skip
+_FORMS = {"depth": lambda space: len(space.shape) == 2, "pose": lambda space: space.shape == (7,)}
+
+Path = tuple[Any, ...]  # keys of Dicts and indices of Tuples
 
 
 @dataclass(frozen=True)
 class ObservationPart:
     """A channel of an observation."""
 
-    key: str | None  # of a Dict; None for the observation itself
+    path: Path  # () for the observation itself
     space: spaces.Space
     form: str = ""  # layout of a picture: "hwc", "chw" or "hw"; "" for other arrays
 
     def read(self, observation: Any, name: str) -> np.ndarray:
         """The value; a picture becomes uint8 [H, W, 3]. TerrellaError where its shape differs from the space."""
-        given = observation if self.key is None else observation[self.key]
-        value = np.asarray(given)
+        value = np.asarray(entry_at(observation, self.path, name))
         if self.form:
-            return as_picture(value, self.form, name)
+            return as_picture(value, self.form, name, white=float(np.max(self.space.high)))  # pyright: ignore[reportAttributeAccessIssue]
         try:
             return np.array(value, dtype=self.space.dtype).reshape(self.space.shape or ())
         except (ValueError, TypeError) as error:
@@ -39,28 +47,95 @@ class ObservationPart:
             ) from error
 
 
-def parts_of(space: spaces.Space, name: str, rgb: bool, drawn: bool) -> dict[str, ObservationPart]:
-    """Channel -> part. The arrays of a Dict keep their names; a picture among them becomes `rgb` if that is wanted and the
-    environment renders none itself (`drawn`). TerrellaError where there is no array."""
-    if not isinstance(space, spaces.Dict):
-        check_space(space, name)
-        form = picture_form(space) if rgb else ""
-        return {"rgb" if form else "observation": ObservationPart(None, space, form)}
-    parts: dict[str, ObservationPart] = {}
-    for key, inner in space.spaces.items():
-        channel = re.sub(r"\W", "_", str(key))
-        if not isinstance(inner, _KNOWN_SPACES):
+@dataclass
+class ObservationParts:
+    """What becomes of each entry of an observation."""
+
+    arrays: dict[str, ObservationPart]  # by channel
+    text: Path | None = None  # the entry that is the text of the task
+    left_out: dict[str, str] = field(default_factory=dict)  # entry -> why it is in no channel
+
+    @property
+    def renamed(self) -> dict[str, str]:
+        """Entry -> channel, where it is called otherwise."""
+        labels = {label_of(part.path): channel for channel, part in self.arrays.items() if part.path}
+        return {label: channel for label, channel in labels.items() if label != channel}
+
+
+def parts_of(space: spaces.Space, seen: Any, rgb: bool, drawn: bool, taken: Iterable[str] = ()) -> ObservationParts:
+    """The channels of an observation, of which `seen` is one. Entries of nested Dicts and Tuples are channels of their own:
+    {"arm": {"pos": ...}} is "arm.pos". A picture among them becomes `rgb` if that is wanted and the environment renders none
+    itself (`drawn`). One text is that of the task. Names in `taken` belong to other channels."""
+    parts, texts = ObservationParts({}), dict[Path, str]()
+    reserved, used = {*_RESERVED, *taken}, set[str]()
+    for path, inner, value in _leaves(space, seen):
+        if isinstance(value, str) and inner is not None:
+            texts[path] = value
             continue
-        form = picture_form(inner)
-        large = rgb and form and min(sorted(inner.shape or ())[-2:]) >= _PIXELS
-        if large and "rgb" not in parts and (channel == "rgb" or not drawn):
-            parts["rgb"] = ObservationPart(key, inner, form)
+        if not isinstance(inner, _KNOWN_SPACES) or 0 in (inner.shape or ()):
+            empty = isinstance(inner, _KNOWN_SPACES)
+            parts.left_out[label_of(path)] = "it is empty" if empty else _kind(inner)
             continue
-        fits = channel != "rgb" and _AXES.get(channel, len(inner.shape or ())) == len(inner.shape or ())
-        parts[channel if fits else f"seen_{channel}"] = ObservationPart(key, inner)
-    if not parts:
-        check_space(space, name)
+        form = picture_form(inner) if rgb else ""
+        large = form and (not path or min(sorted(inner.shape or ())[-2:]) >= _PIXELS)
+        name = _channel(path)
+        if large and "rgb" not in parts.arrays and (not drawn or name == "rgb" or not path):
+            parts.arrays["rgb"] = ObservationPart(path, inner, form)
+            continue
+        kind = kind_of(name)
+        if {name, kind} & reserved or (kind in _FORMS and not _FORMS[kind](inner)):
+            name = f"seen_{name}"
+        name = next(one for one in chain([name], (f"{name}_{n}" for n in count(2))) if one.lower() not in used)
+        used.add(name.lower())
+        parts.arrays[name] = ObservationPart(path, inner)
+    names = sorted(texts, key=lambda path: str(path[-1]).lower() not in TASK_NAMES if path else False)
+    parts.text = names[0] if names else None
+    parts.left_out |= {label_of(path): "a text beside that of the task" for path in names[1:]}
     return parts
+
+
+def _leaves(space: Any, seen: Any, path: Path = ()) -> Iterator[tuple[Path, Any, Any]]:
+    """(path, space, value) of each entry; the space is None for what an observation has and its space does not declare."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        yield path, space, seen
+        return
+    inner: dict[Any, Any] = dict(space.spaces if isinstance(space, spaces.Dict) else enumerate(space.spaces))
+    for key, part in inner.items():
+        yield from _leaves(part, entry_at(seen, (key,), "", None), (*path, key))
+    for key in seen if isinstance(seen, Mapping) else ():
+        if key not in inner:
+            yield (*path, key), None, None
+
+
+def entry_at(observation: Any, path: Path, name: str, *default: Any) -> Any:
+    """The entry of a nested observation; `default`, or TerrellaError, where it has none."""
+    value = observation
+    for key in path:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            if default:
+                return default[0]
+            raise TerrellaError(
+                f"{name} gave an observation without '{label_of(path)}', which its space declares."
+            ) from None
+    return value
+
+
+def label_of(path: Path) -> str:
+    """How an entry is called for people: "arm/pos"."""
+    return "/".join(map(str, path)) or "observation"
+
+
+def _channel(path: Path) -> str:
+    words = [re.sub(r"\W", "_", str(key)) or "_" for key in path]
+    if not words or isinstance(path[0], int):
+        words.insert(0, "observation")
+    return ".".join(words)
+
+
+def _kind(space: Any) -> str:
+    return "its space does not declare it" if space is None else f"a {type(space).__name__}"
 
 
 def check_space(space: spaces.Space, name: str) -> None:
@@ -70,16 +145,16 @@ def check_space(space: spaces.Space, name: str) -> None:
 
 
 def picture_form(space: spaces.Space) -> str:
-    """The layout of a space of pictures (uint8, or floats up to 1): "hwc", "chw", "hw"; else ""."""
+    """The layout of a space of pictures (uint8, or floats from 0 to 1 or to 255): "hwc", "chw", "hw"; else ""."""
     shape = space.shape or ()
     if not isinstance(space, spaces.Box):
         return ""
     if space.dtype == np.uint8 and len(shape) == 3 and shape[2] == 3:
         return "hwc"
-    bright = space.dtype == np.uint8 or (
-        space.dtype.kind == "f" and bool((space.low >= 0).all() and (space.high == 1).all())
+    whites = (
+        space.dtype.kind == "f" and (space.low >= 0).all() and ((space.high == 1).all() or (space.high == 255).all())
     )
-    if not bright or len(shape) not in (2, 3):
+    if not (space.dtype == np.uint8 or whites) or len(shape) not in (2, 3):
         return ""
     for form, size, depth in (("hwc", shape[:2], shape[2:]), ("chw", shape[1:], shape[:1]), ("hw", shape, (1,))):
         if len(size) == 2 and len(depth) == 1 and depth[0] in (1, 3) and min(size) >= _PIXELS:
@@ -87,12 +162,12 @@ def picture_form(space: spaces.Space) -> str:
     return ""
 
 
-def as_picture(value: np.ndarray, form: str, name: str) -> np.ndarray:
-    """A picture of any layout as uint8 [H, W, 3]."""
+def as_picture(value: np.ndarray, form: str, name: str, white: float = 1.0) -> np.ndarray:
+    """A picture of any layout as uint8 [H, W, 3]; `white` is the largest of its floats."""
     if value.ndim != len(form):
         raise TerrellaError(f"{name} gave a picture of shape {value.shape}, which does not match its space.")
     if value.dtype != np.uint8:
-        value = (np.clip(value, 0, 1) * 255).round().astype(np.uint8)
+        value = (np.clip(value / white, 0, 1) * 255).round().astype(np.uint8)
     value = value.transpose(1, 2, 0) if form == "chw" else value[..., None] if form == "hw" else value
     return value if value.shape[2] == 3 else value.repeat(3, 2)
 

@@ -14,7 +14,7 @@ from ..core.world import Observation, World, make_rng
 REWARD = "reward"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
 _WILDCARDS = ("_", "any", "nan")
-_NO_STATE = ("reward", "done", "uncertainty", "truncated", "snapshot", "latent", "instruction")
+_NO_STATE = ("reward", "done", "uncertainty", "truncated", "snapshot", "latent", "text", "instruction")
 
 
 def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:

@@ -18,7 +18,7 @@ from .opening import EnvironmentConfig
 STEPS = 200  # of an episode, where the environment sets no limit
 _SIZE = re.compile(r"^[\d.e+-]+ ")  # 8 of "8 N m"
 _NOT_COMPARED = {
-    "snapshot", "reward", "done", "truncated", "uncertainty", "known", "places", "mosaic", "instruction", "latent",
+    "snapshot", "reward", "done", "truncated", "uncertainty", "known", "places", "mosaic", "text", "instruction", "latent",
 }  # fmt: skip
 
 

@@ -20,6 +20,7 @@ def describe(spec: Spec) -> list[str]:
     how = spec.card.get("how")
     chosen = lambda what: f" ({how[what]})" if isinstance(how, Mapping) and what in how else ""  # noqa: E731
     drawn, names = spec.channels.get("rgb"), spec.action_names
+    fps = " (--fps)" if isinstance(how, Mapping) and ";" in str(how.get("frame rate")) else ""
     height, width = (drawn.shape or (0, 0))[:2] if drawn is not None else (0, 0)
     limit = f"{LONGEST:,} steps, as none is declared"
     if spec.max_episode_steps:
@@ -27,13 +28,33 @@ def describe(spec: Spec) -> list[str]:
     keys = ", ".join(f"{key} {_action_text(spec, action)}" for key, action in spec.keys.items() if "+" not in key)
     rest = _action_text(spec, neutral_action(spec).reshape(-1).tolist())
     return [
-        f"{spec.name}: pictures of {height}x{width} (--size)" if drawn is not None else
+        f"{spec.name}: pictures of {height}x{width}{chosen('pictures')} (--size)" if drawn is not None else
         f"{spec.name} shows no pictures: the recording holds numbers only, and no world that draws can be trained on it.",
-        f"{1 / spec.dt_s:g} steps a second{chosen('frame rate')}; episodes of up to {limit}.",
+        f"{1 / spec.dt_s:g} steps a second{chosen('frame rate')}{fps}; episodes of up to {limit}.",
         f"Actions: {', '.join(names) or spec.action}{chosen('action names')}; at rest: "
         + (rest if can_idle(spec) else f"{rest}, as none is declared to do nothing (--idle)"),
         f"Keys: {keys or 'none (--keys)'}{chosen('keys')}",
+        *_observed(spec),
     ]  # fmt: skip
+
+
+def _observed(spec: Spec) -> list[str]:
+    """Lines on the channels of an environment, on the names that were changed, and on what is in no channel."""
+    from ..data.channels import feature_of, features_of
+
+    how, renamed, left_out = (spec.card.get(name) for name in ("how", "renamed", "left_out"))
+    task = how.get("task") if isinstance(how, Mapping) else None
+    names = dict(renamed) if isinstance(renamed, Mapping) else {}
+    features = features_of(spec.recorded).items()
+    names |= {channel: feature for channel, feature in features if "observation.pose" != feature != feature_of(channel)}
+    left = dict(left_out) if isinstance(left_out, Mapping) else {}
+    channels = [name for name in spec.channels if name not in ("text", "instruction")]
+    return [
+        *([f"Channels: {', '.join(channels)}."] if isinstance(how, Mapping) else []),
+        *([f"The task of each episode: {task}."] if task else []),
+        *([f"Names: {', '.join(f'{name} is {now}' for name, now in names.items())}."] if names else []),
+        *([f"Left out: {', '.join(f'{name} ({why})' for name, why in left.items())}."] if left else []),
+    ]
 
 
 def _action_text(spec: Spec, action: list[float]) -> str:

@@ -7,11 +7,11 @@ import numpy as np
 from gymnasium import spaces
 
 from ...core.errors import DatasetError
+from ...core.instruction import TASK_NAMES
 from ...data.source import Sensor
 from .arrays import Array, Place
 from .rows import stored_shape
 
-_INSTRUCTIONS = ("mission", "task", "instruction", "language_instruction", "prompt")  # Text spaces that hold the task
 _NO_ARRAYS = ("Sequence", "Graph", "OneOf", "Unknown")  # spaces whose values are not arrays of one shape
 _MAX_DEPTH = 32
 
@@ -44,7 +44,7 @@ def _flat(space: Any, place: Place) -> Iterator[tuple[Place, Array | None]]:
 
 def is_instruction(place: Place) -> bool:
     """Whether a text at this place is an instruction, by its name."""
-    return str(place[-1]).lower() in _INSTRUCTIONS
+    return str(place[-1]).lower() in TASK_NAMES
 
 
 def split_texts(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[str, dict[str, list[str]]]:
