@@ -5,7 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import os
 import secrets
+import shlex
+import shutil
 import signal
 import socket
 import sys
@@ -59,6 +62,18 @@ def open_port(host: str, port: int) -> socket.socket:
         ) from error
     listener.setblocking(False)
     return listener
+
+
+def starting_command() -> str:
+    """The `terrella` command that started this process, to be typed again; empty for another program."""
+    program, *given = sys.argv
+    if Path(program).name not in ("terrella", "__main__.py"):
+        return ""
+    known = shutil.which("terrella")
+    short = (
+        Path(program).name == "__main__.py" or known is not None and Path(known).resolve() == Path(program).resolve()
+    )
+    return shlex.join(["terrella" if short else os.path.relpath(program), *given])
 
 
 def page_address(host: str, port: int, token: str | None) -> str:

@@ -29,7 +29,7 @@ from ..space.occupancy import Occupancy, Walker, samples
 from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
-from .http_server import WEB, application, posted, serve_page
+from .http_server import WEB, application, posted, serve_page, starting_command
 from .place_frames import FrameRenderer
 
 PAGE = WEB / "place"
@@ -91,6 +91,7 @@ class PlacePage:
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside,
+            "command": starting_command() if save or watch or frames else "",
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,

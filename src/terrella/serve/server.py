@@ -25,7 +25,7 @@ from .agent import Agents, agents_of
 from .chart import has_known_share, map_kind
 from .clip import make_clip
 from .guard import RateLimit
-from .http_server import application, serve_page
+from .http_server import application, serve_page, starting_command
 from .keys import Keep, KeyBook
 from .picture import uncertainty_levels
 from .presentation import aims, drawn_by, events_of, numbers_of
@@ -130,7 +130,7 @@ class Sessions:
                 for world, label in zip(self.worlds, labels, strict=True)
             ],
             no_rewind=no_rewind(self.worlds),
-            command=self.config.command,
+            command=self.config.command or starting_command(),
             home=self.config.home,
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             agent=self._agents is not None,

@@ -18,7 +18,7 @@ from starlette.routing import Route
 
 from ..core.errors import ServeError, TerrellaError
 from . import readings
-from .http_server import application, posted, serve_page
+from .http_server import application, posted, serve_page, starting_command
 
 _LONGEST_MESSAGE = 4096  # bytes of a POST, at most
 _BUCKETS = 4096  # of a series, at most
@@ -131,6 +131,7 @@ class _Routes:
     def about(self, request: Request) -> Response:
         path = self._exporting.path
         about = {**self._viewable.about(), "export_to": str(path) if path else ""}
+        about["command"] = starting_command()
         return JSONResponse({**about, "episodes": self._viewable.listing(), "bad": self._viewable.marks()})
 
     def episode(self, request: Request) -> Response:

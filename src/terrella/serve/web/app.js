@@ -290,8 +290,7 @@ async function clip() {
   $('clip').setAttribute('aria-busy', 'true');
   toast('Making a video of the last seconds.');
   try {
-    const answer = await fetch(link.clipAddress());
-    if (!answer.ok) throw new Error(await answer.text());
+    const answer = await reach(link.clipAddress(), command);
     const name = /filename="([^"]+)"/.exec(answer.headers.get('content-disposition'))?.[1] ?? 'terrella.mp4';
     const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(await answer.blob()), download: name });
     anchor.click();

@@ -9,6 +9,7 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
+import { reach } from './reach.js';
 import { Remote } from './remote.js';
 import { decoded, inflate, joined, Reader, unpackScene } from './scene.js';
 import { Solid } from './solid.js';
@@ -17,7 +18,7 @@ import { Story } from './story.js';
 import { Walker } from './walk.js';
 
 const $ = (id) => document.getElementById(id);
-const TALL = 0.62, WIDEST = 1.35, SLOW_MS = 40, FAST_MS = 20, COARSEST = 0.25, LEAST = 0.04, FEWEST = 20000;
+const TALL = 0.62, WIDEST = 1.35, SLOW_MS = 40, FAST_MS = 20, COARSEST = 0.25, LEAST = 0.04, FEWEST = 12000, LEAD = 0.06;
 const seen = { painted: 0, times: [], share: 1, stands: 1, dirty: true, last: 0, running: false, toasted: 0, sorted: '', solidOf: null };
 
 const world = JSON.parse($('world').textContent), canvas = $('view');
@@ -30,7 +31,7 @@ const ready = await open().catch((error) => {
 });
 
 async function open() {
-  const drawing = world.frames && !document.createElement('canvas').getContext('webgl2') ? new Remote(canvas, world.frames, toast) : new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
+  const drawing = world.frames && !document.createElement('canvas').getContext('webgl2') ? new Remote(canvas, world.frames, world.command, toast) : new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
   const story = new Story(source, [], source.length === world.count ? await others() : undefined);
   try { story.begin(source, world.edits); } catch (error) { if (source.length === world.count) throw error; }  // the rest comes
@@ -66,7 +67,7 @@ if (ready) run(ready);
 function run({ drawing, source, story, solid: first }) {
   let solid = first, made = '';
   const walker = new Walker(world), map = new MiniMap($('minimap').querySelector('canvas'));
-  const sorter = new Sorter(({ order, within, all }) => { drawing.order(order, within); seen.visible = all; redraw(); });
+  const sorter = new Sorter(({ order, coarse, all, view }) => { drawing.order(order, coarse); Object.assign(seen, { visible: all, looked: view.looks }); redraw(); });
   const hands = new Hands(canvas, $('stick'), {
     moved: wake, tool: (name, event) => editor.open && editor.selecting.handle(name, event),
     look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
@@ -158,14 +159,20 @@ function run({ drawing, source, story, solid: first }) {
     seen.dirty = true;
   }
 
-  function sight() { return { eye: walker.eye.place, ...axes(walker.eye), ...lens(), near: NEAR }; }
+  function sight() { return { eye: walker.eye.place, ...axes(walker.eye), ...lens(), near: NEAR, looks: [walker.eye.heading, walker.eye.pitch] }; }
+
+  /** The eye, turned no farther than the last order reaches to the sides: beyond it nothing is drawn yet. */
+  function shownEye() {
+    const { place, heading, pitch } = walker.eye, near = (at, middle) => Math.max(middle - LEAD, Math.min(middle + LEAD, at));
+    return seen.looked && !drawing.remote ? { place, heading: near(heading, seen.looked[0]), pitch: near(pitch, seen.looked[1]) } : walker.eye;
+  }
 
   function paint() {
     const sharp = (devicePixelRatio || 1) * Math.max(COARSEST, seen.share), width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     seen.dirty = false;
     drawing.clear();
-    const view = { ...matrices(walker.eye, lens()), eye: walker.eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
+    const eye = shownEye(), view = { ...matrices(eye, lens()), eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
     drawing.paint(view, part, editor.wires);
     compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
@@ -236,7 +243,7 @@ function run({ drawing, source, story, solid: first }) {
   if (world.watch) {
     $('making').hidden = false;
     $('edit').hidden = $('compared').hidden = true;
-    follow(world.watch, { newer, over: () => { $('making').hidden = true; toast('The fit is done, or was stopped.'); } });
+    follow(world.watch, { newer, over: () => { $('making').hidden = true; toast(`The fit is done, or was stopped.${world.command ? ` If stopped, \`${world.command}\` continues it.` : ''}`); } });
   }
 
   // the state of the page, for scripts
@@ -256,8 +263,7 @@ function run({ drawing, source, story, solid: first }) {
 /** Keeps edits: at the server that showed this page, or as a file. */
 async function keep(lines, saved) {
   if (world.save) {
-    const answer = await fetch(world.save + location.search, { method: 'POST', body: JSON.stringify({ saved, lines }) });
-    if (!answer.ok) throw new Error(await answer.text());
+    await reach(world.save + location.search, world.command, { method: 'POST', body: JSON.stringify({ saved, lines }) });
     toast('Saved with the place.');
     return;
   }
@@ -279,5 +285,5 @@ function toast(text) {
   $('toast').textContent = text.charAt(0).toUpperCase() + text.slice(1);
   $('toast').classList.add('show');
   clearTimeout(seen.toasted);
-  seen.toasted = setTimeout(() => $('toast').classList.remove('show'), 6000);
+  seen.toasted = setTimeout(() => $('toast').classList.remove('show'), Math.max(6000, 90 * text.length));
 }

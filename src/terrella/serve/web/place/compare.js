@@ -24,7 +24,7 @@ export class Compare {
     $('compared').setAttribute('aria-pressed', this.open);
     if (scene) {
       this.drawing ??= new Drawing($('other'));
-      this.sorter ??= new Sorter(({ order, within }) => { this.drawing.order(order, within); this.redraw(); });
+      this.sorter ??= new Sorter(({ order, coarse }) => { this.drawing.order(order, coarse); this.redraw(); });
       this.drawing.set(scene, 1);
       this.sorter.set(scene);
       $('other-name').textContent = name;

@@ -12,7 +12,7 @@ export class Drawing {
   constructor(canvas) {
     const gl = canvas.getContext('webgl2', { antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella space view`, which then draws on its own machine.');
-    Object.assign(this, { canvas, gl, ready: false, count: 0, within: Infinity, stands: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
+    Object.assign(this, { canvas, gl, ready: false, count: 0, coarse: 0, stands: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
     this.preview = this.still;
     this.splats = program(gl, SPLAT_SHADERS);
     this.lines = program(gl, LINE_SHADERS);
@@ -55,12 +55,12 @@ export class Drawing {
     upload(gl, this.flags, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, ACROSS, rows, data);
   }
 
-  /** The order to draw in. Farther away than `within` metres there are fewer: each stands for others, and is so much larger. */
-  order(order, within = Infinity) {
+  /** The order to draw in. coarse: each stands for a cube of so many metres for each metre away, and covers it; 0: for itself. */
+  order(order, coarse = 0) {
     const { gl } = this, rows = Math.max(1, Math.ceil(order.length / ACROSS)), data = new Uint32Array(rows * ACROSS);
     data.set(order);
     upload(gl, this.orders, gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, ACROSS, rows, data);
-    Object.assign(this, { ready: true, count: order.length, within });
+    Object.assign(this, { ready: true, count: order.length, coarse });
   }
 
   clear(target = null) {
@@ -106,7 +106,7 @@ export class Drawing {
     gl.uniformMatrix4fv(splats.at('view'), false, view);
     gl.uniformMatrix4fv(splats.at('projection'), false, projection);
     gl.uniform2f(splats.at('size'), width, height);
-    gl.uniform1f(splats.at('within'), Math.min(this.within, 1e4));
+    gl.uniform1f(splats.at('coarse'), this.coarse);
     gl.uniform1f(splats.at('stands'), this.stands);
     gl.uniform1i(splats.at('tint'), this.tint);
     gl.uniform3fv(splats.at('middle'), preview.middle);

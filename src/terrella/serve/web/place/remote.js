@@ -1,11 +1,13 @@
 // Draws where the browser cannot: frames come from the server that showed the page. It stands in for Drawing.
 
+import { reach } from './reach.js';
+
 const SMALL = 400, LARGE = 960;  // pixels of a frame's longer side, on the way and at rest
 
 export class Remote {
-  /** failed(text): a frame did not come. */
-  constructor(canvas, address, failed) {
-    Object.assign(this, { canvas, address, failed, context: canvas.getContext('2d'), remote: true, ready: true, count: 0, tint: 0, still: {}, busy: false, next: null });
+  /** command: what starts the server; failed(text): a frame did not come. */
+  constructor(canvas, address, command, failed) {
+    Object.assign(this, { canvas, address, command, failed, context: canvas.getContext('2d'), remote: true, ready: true, count: 0, tint: 0, still: {}, busy: false, next: null });
   }
 
   set() {}
@@ -36,8 +38,6 @@ export class Remote {
   }
 
   async frame(address) {
-    const answer = await fetch(address);
-    if (!answer.ok) throw new Error(await answer.text());
-    return createImageBitmap(await answer.blob());
+    return createImageBitmap(await (await reach(address, this.command)).blob());
   }
 }

@@ -7,7 +7,7 @@ uniform ivec2 range;
 uniform mat4 view, projection;
 uniform vec2 size, turn;
 uniform vec3 middle, move;
-uniform float factor, within, stands;
+uniform float factor, coarse, stands;
 uniform int tint;
 out vec4 colour;
 out vec2 off;
@@ -38,9 +38,12 @@ void main() {
   vec2 slope = clamp(at.xy / ahead, -limit, limit);
   mat3 linear = mat3(focal.x / ahead, 0, 0, 0, focal.y / ahead, 0, slope.x * focal.x / ahead, slope.y * focal.y / ahead, 0);
   mat3 whole = linear * mat3(view);
-  float thinned = stands * max(1.0, dot(at, at) / (within * within));  // how many this one stands for
-  mat3 flat_ = thinned * whole * spread * transpose(whole);
-  float a = flat_[0][0] + 0.3, b = flat_[0][1], e = flat_[1][1] + 0.3, half_ = (a + e) / 2.0, apart = length(vec2((a - e) / 2.0, b));
+  mat3 flat_ = stands * whole * spread * transpose(whole);
+  float a = flat_[0][0], b = flat_[0][1], e = flat_[1][1], half_ = (a + e) / 2.0, apart = length(vec2((a - e) / 2.0, b));
+  float cube = coarse * length(at) < 0.01 ? 0.0 : 0.95 * coarse * focal.y, grown = max(0.3, cube * cube - max(half_ - apart, 0.0));  // covers its cube
+  a += grown;
+  e += grown;
+  half_ += grown;
   float long_ = half_ + apart, wide = max(half_ - apart, 0.05);
   vec2 axis = abs(b) > 1e-6 ? normalize(vec2(b, long_ - a)) : (a >= e ? vec2(1, 0) : vec2(0, 1));
   most = log(opacity * 255.0);

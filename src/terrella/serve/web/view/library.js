@@ -1,5 +1,7 @@
 // The data of the server, fetched once and cached: the list, an episode's times and series, and its readings ahead of need.
 
+import { reach } from '../place/reach.js';
+
 const AT_ONCE = 5;  // requests for readings under way
 const KEPT_BYTES = 320e6;  // of decoded readings
 
@@ -8,15 +10,17 @@ const query = () => {
   return token ? `token=${encodeURIComponent(token)}` : '';
 };
 
-async function ask(path, options) {
-  const answer = await fetch(`${path}${path.includes('?') ? '&' : '?'}${query()}`, options);
-  if (!answer.ok) throw new Error(await answer.text());
-  return answer;
-}
+let command = '';  // what starts the server
+
+const ask = (path, options) => reach(`${path}${path.includes('?') ? '&' : '?'}${query()}`, command, options);
 
 const post = (path, body) => ask(path, { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body) });
 
-export const about = async () => (await ask('/about')).json();
+export async function about() {
+  const facts = await (await ask('/about')).json();
+  ({ command } = facts);
+  return facts;
+}
 export const mark = async (episode, bad) => (await (await post('/mark', { episode, bad })).json()).bad;
 export const startExport = async () => (await post('/export', {})).json();
 export const exportStatus = async () => (await ask('/export')).json();
