@@ -1,15 +1,18 @@
 """Makes docs/images/play.webp: a few seconds inside a learned world, with the keys that are held.
 
-    python recipes/play_animation.py docs/images/play.webp --seed 3
+    python recipes/play_animation.py docs/images/play.webp --seed 5
 
-Every frame is drawn by the world from the state before it and the keys; the keys are those of act/explorer.py.
+Every frame is drawn by the world from the state before it and the keys. The keys are those of act/explorer.py, and where
+things move those of `shoot`.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 from tyro.conf import Positional
@@ -21,17 +24,17 @@ from terrella.core.policy import act
 GROUND, RAISED, LINE, INK, MUTED, HELD = "#0b0c0f", "#14161a", "#24272d", "#eceae4", "#8d9097", "#7fe3c4"
 CAPS = [  # label, column, row, action
     ("W", 1, 0, "MOVE_FORWARD"), ("A", 0, 1, "MOVE_LEFT"), ("S", 1, 1, "MOVE_BACKWARD"), ("D", 2, 1, "MOVE_RIGHT"),
-    ("<", 4, 1, "TURN_LEFT"), (">", 5, 1, "TURN_RIGHT"),
+    ("<", 4, 1, "TURN_LEFT"), (">", 5, 1, "TURN_RIGHT"), ("Space", 4, 0, "ATTACK"),
 ]  # fmt: skip
 CAP, GAP, MARGIN = 34, 4, 14
 
 
 def main(
     out: Positional[Path] = Path("docs/images/play.webp"),
-    world: str = "doom-maze",
-    seed: int = 3,
-    skip: int = 40,
-    seconds: float = 9.0,
+    world: str = "doom-corridor",
+    seed: int = 5,
+    skip: int = 0,
+    seconds: float = 4.0,
     every: int = 2,
     scale: int = 4,
     quality: int = 74,
@@ -56,15 +59,38 @@ def play(world, seed: int, skip: int, steps: int) -> tuple[list[Image.Image], li
     """The world's pictures, and the names of the buttons held at each."""
     spec, rng = world.spec, terrella.make_rng(seed)
     policy, state = Explorer(spec), world.start(1, rng)
-    memory, pictures, pressed = policy.begin(1, rng), [], []
+    memory, aim, pictures, pressed = policy.begin(1, rng), None, [], []
+    channels = tuple(name for name in ("rgb", "depth", "pose", "things") if name in spec.channels)
     for step in range(skip + steps):
-        seen = world.render(state, ("rgb", "depth", "pose"))
-        action, memory = act(policy, seen, memory, 1, spec, rng)
+        seen = world.render(state, channels)
+        if "things" in seen:
+            held, aim = shoot(seen, aim)
+            action = torch.tensor([[name in held for name in spec.action_names]], dtype=torch.int8)
+        else:
+            action, memory = act(policy, seen, memory, 1, spec, rng)
         if step >= skip:
             pictures.append(Image.fromarray(seen["rgb"][0].cpu().numpy()))
             pressed.append({name for name, on in zip(spec.action_names, action[0].tolist()) if on})
         state = world.imagine(state, action, rng)
     return pictures, pressed
+
+
+def shoot(seen: dict[str, torch.Tensor], aim: float | None) -> tuple[set[str], float | None]:
+    """The buttons of a player who shoots at whatever stands at the height of the eye, the left one first, and else walks along
+    the corridor; and the column of the picture aimed at."""
+    height, width = seen["things"].shape[1:3]
+    standing = (seen["things"][:, int(0.42 * height) : int(0.52 * height)] > 0).float().sum(1)
+    standing = F.avg_pool1d(standing.view(1, 1, width), 9, 1, 4)[0, 0]
+    if standing.max() > 1.2:
+        aim = 0.3 * width if aim is None else aim
+        aim = float((standing * torch.exp(-(torch.arange(width) - aim).abs() / 10)).argmax())
+        off = aim - width / 2
+        turn = set() if abs(off) <= 4 else {"TURN_LEFT" if off < 0 else "TURN_RIGHT"}
+        return turn | ({"ATTACK"} if abs(off) < 7 else set()), aim
+    w, x, y, z = seen["pose"][0, 3:].tolist()
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turn = set() if abs(yaw) < 0.08 else {"TURN_RIGHT" if yaw > 0 else "TURN_LEFT"}
+    return turn | ({"MOVE_FORWARD"} if abs(yaw) < 0.5 else set()), None
 
 
 def draw(picture: Image.Image, held: set[str], spec, scale: int) -> Image.Image:
@@ -74,9 +100,12 @@ def draw(picture: Image.Image, held: set[str], spec, scale: int) -> Image.Image:
     frame.paste(picture.resize((width, height), Image.Resampling.NEAREST))
     pen, font, small = ImageDraw.Draw(frame), ImageFont.load_default(15), ImageFont.load_default(13)
     for label, column, row, name in CAPS:
+        if name not in spec.action_names:
+            continue
         x, y, on = MARGIN + column * (CAP + GAP), height + MARGIN + row * (CAP + GAP), name in held
-        pen.rounded_rectangle((x, y, x + CAP, y + CAP), 6, HELD if on else RAISED, HELD if on else LINE)
-        ink, middle = (GROUND if on else INK), (x + CAP / 2, y + CAP / 2)
+        wide = 2 * CAP + GAP if len(label) > 1 else CAP
+        pen.rounded_rectangle((x, y, x + wide, y + CAP), 6, HELD if on else RAISED, HELD if on else LINE)
+        ink, middle = (GROUND if on else INK), (x + wide / 2, y + CAP / 2)
         if label in "<>":
             tip = -7 if label == "<" else 7
             pen.polygon([(middle[0] + tip, middle[1])] + [(middle[0] - tip / 2, middle[1] + d) for d in (-6, 6)], ink)
@@ -84,7 +113,7 @@ def draw(picture: Image.Image, held: set[str], spec, scale: int) -> Image.Image:
             pen.text(middle, label, ink, font, anchor="mm")
     right, top = width - MARGIN, height + MARGIN + CAP + GAP / 2
     pen.text((right, top - 10), f"terrella play {spec.name}", INK, font, anchor="rm")
-    pen.text((right, top + 12), "every frame drawn by a learned model", MUTED, small, anchor="rm")
+    pen.text((right, top + 12), "a neural network draws every frame", MUTED, small, anchor="rm")
     return frame
 
 
