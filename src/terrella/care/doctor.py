@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ..core.errors import DatasetError
+from ..data.channels import DONE
 from ..data.format import INFO, STATS
 from ..data.storage import journal, mp4
 from .film_checks import FilmFacts, equal_digests, examine_films
@@ -72,6 +73,7 @@ def examine(root: str | Path) -> Examination:
     faults += [] if busy else check_statistics(folder, rows)  # they may count the episode that is being committed
     faults += _duplicates(folder, rows, shown)
     still, notes = constant_columns(folder, rows)
+    notes += _padding(folder)
     faults += [*still, *frozen_states(folder, rows, shown.static), *check_alignment(folder, rows, shown)]
     if busy:
         notes.append("a recorder is writing to this folder now; the episode that it is recording was not examined")
@@ -162,6 +164,21 @@ def _counts(folder: Survey, busy: bool) -> Iterator[Fault]:
             yield Fault(INFO, None, what, f"set total_frames to {expected}")
     if not isinstance(count, int) or not isinstance(length, int):
         yield Fault(INFO, None, "total_episodes or total_frames is not a whole number", FROM_ROWS)
+
+
+def _padding(folder: Survey) -> Iterator[str]:
+    """A note on each sensor that some episodes have no reading of."""
+    absent: dict[str, list[int]] = {}
+    for number, episode in folder.episodes.items():
+        for name in episode.absent:
+            absent.setdefault(name, []).append(number)
+    for name, numbers in absent.items():
+        if name in folder.features and name != DONE:
+            some = ", ".join(map(str, numbers[:_EXAMPLES])) + ", …" * (len(numbers) > _EXAMPLES)
+            yield (
+                f"{name} has no readings in {len(numbers)} of {len(folder.episodes)} episodes ({some}): their rows of it are "
+                "padding, which training leaves out"
+            )
 
 
 # -- duplicates ------------------------------------------------------------------------------------------------------

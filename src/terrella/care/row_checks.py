@@ -341,8 +341,9 @@ def frozen_states(survey: Survey, facts: RowFacts, unmoving: set[int]) -> Iterat
     pictured = any(feature["dtype"] in ("video", "image") for feature in survey.features.values())
     for number, seen in facts.episodes.items():
         acted = _joined(seen, ACTION)
+        padding = survey.episodes[number].absent if number in survey.episodes else ()
         for name in seen.changed:
-            if name == ACTION or (begin_end := _still(_joined(seen, name))) is None:
+            if name == ACTION or name in padding or (begin_end := _still(_joined(seen, name))) is None:
                 continue
             begin, end = begin_end
             changes = int(acted[begin + 1 : min(end, seen.rows - 1)].sum()) if ACTION in seen.changed else 0

@@ -119,6 +119,11 @@ class Episode:
         return self.tasks[0] if self.tasks else ""
 
     @property
+    def absent(self) -> tuple[str, ...]:
+        """The sensors that it has no reading of: what its rows hold of them is padding."""
+        return tuple(name for name, count in (self.counts or {}).items() if count == 0)
+
+    @property
     def length(self) -> int:
         """Number of rows."""
         return self.stop - self.start

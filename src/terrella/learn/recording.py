@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from ..core.errors import DatasetError
 from ..core.spec import Spec
 from ..data import ClipCache, Dataset, split
+from ..data.training.cache import episodes_with
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
@@ -51,7 +52,8 @@ class Recording:
     ) -> Recording:
         """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitted_size`). A clip
         cache of it is kept on this machine, for rows are read in random order. Every 20th episode is held out, and so are the
-        rows in which something in the box `keep_out` is visible. DatasetError if it lacks a channel of `needs`, or rows."""
+        rows in which something in the box `keep_out` is visible; episodes without a channel of `needs` are left out. DatasetError
+        if it lacks a channel of `needs`, or rows."""
         dataset = data if isinstance(data, Dataset) else Dataset(data)
         size = size or fitted_size(dataset)
         cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
@@ -60,7 +62,8 @@ class Recording:
             raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
         if keep_out is not None and not has_channel(cache, "pose"):
             raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
-        train, held_out = split(len(cache.episodes))
+        whole = set(episodes_with(needs, np.arange(len(cache.episodes)), cache.absent).tolist())
+        train, held_out = ([number for number in part if number in whole] for part in split(len(cache.episodes)))
         recording = Recording.of(cache, train, keep_out)
         return replace(recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
 

@@ -7,7 +7,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import islice
 from pathlib import Path
@@ -42,6 +42,7 @@ class ClipCache:
     episodes: (start, stop) row ranges; `ranges` is the same as int64 [E, 2].
     arrays:   name -> array: those below that the recording has, and its other vectors ("observation.state", …).
     keys:     channel -> name of its array.
+    absent:   name of an array -> the episodes in which it is padding: they have no reading of it.
     """
 
     rgb: np.ndarray | None  # uint8 [N, H, W, 3]; like the others, None where the recording has none
@@ -64,6 +65,7 @@ class ClipCache:
             self.fps, self.action_names, self.world = about["fps"], tuple(about["action_names"]), about["world"]
             self.tasks: tuple[str, ...] = tuple(about["tasks"])
             self.keys: dict[str, str] = dict(about["keys"])
+            self.absent: dict[str, list[int]] = dict(about.get("absent", {}))
             short = [name for name, array in self.arrays.items() if len(array) != self.length]
             if short:
                 raise ValueError(f"{short[0]} has {len(self.arrays[short[0]])} of {self.length} rows")
@@ -178,6 +180,7 @@ def _key(dataset: Dataset, size: tuple[int, int]) -> str:
         for name in sorted(set(episode.files).difference(last)):
             digest.update(f"{name}:{files.mark(name)};".encode())
         last = episode.files
+    digest.update(json.dumps(absent_of(dataset)).encode() if absent_of(dataset) else b"")
     return digest.hexdigest()[:16]
 
 
@@ -233,10 +236,9 @@ def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path
                 job.cancel()
             raise
     ranges = np.stack([dataset.episodes.starts, dataset.episodes.stops], 1)
-    facts = {"action_names": list(dataset.action_names), "world": dataset.world}
-    finish_cache(
-        staged, path, arrays, ranges, dataset.fps, facts | {"tasks": list(dataset.tasks), "keys": keys_of(dataset)}
-    )
+    facts = {"action_names": list(dataset.action_names), "world": dataset.world, "tasks": list(dataset.tasks)}
+    facts |= {"keys": keys_of(dataset), "absent": absent_of(dataset)}
+    finish_cache(staged, path, arrays, ranges, dataset.fps, facts)
 
 
 def further_cameras(dataset: Dataset, channels: Sequence[str]) -> list[str]:
@@ -256,6 +258,25 @@ def keys_of(dataset: Dataset) -> dict[str, str]:
     """channel -> the array that holds it."""
     arrays = {dataset.feature(name): name for name in _TYPES if dataset.feature(name)}
     return {channel: arrays.get(feature, current_feature(feature)) for channel, feature in dataset.channels.items()}
+
+
+def absent_of(dataset: Dataset) -> dict[str, list[int]]:
+    """array -> the episodes that have no reading of it, where others have. An episode without `done` is none of these: it did
+    not end."""
+    arrays = {dataset.feature(name): name for name in _TYPES if dataset.feature(name)}
+    absent: dict[str, list[int]] = {}
+    for number, episode in enumerate(dataset.episodes):
+        for feature in episode.absent:
+            absent.setdefault(arrays.get(feature, current_feature(feature)), []).append(number)
+    return {
+        name: numbers for name, numbers in absent.items() if name != "done" and len(numbers) < len(dataset.episodes)
+    }
+
+
+def episodes_with(channels: Iterable[str], numbers: np.ndarray, absent: Mapping[str, Sequence[int]]) -> np.ndarray:
+    """Those of the episodes `numbers` that have readings of all `channels`, names of arrays."""
+    lacking = {number for name in channels for number in absent.get(name, ())}
+    return numbers[~np.isin(numbers, sorted(lacking))]
 
 
 def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:
@@ -315,7 +336,7 @@ def finish_cache(
 ) -> None:
     """Makes a folder of filled arrays and `ranges` int64 [E, 2] the cache at `path`, in one step.
 
-    facts: action_names, world, tasks and keys, where they are known.
+    facts: action_names, world, tasks, keys and absent, where they are known.
     """
     np.save(staged / "episodes.npy", ranges)
     for name in [*arrays, "episodes"]:

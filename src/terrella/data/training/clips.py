@@ -18,7 +18,7 @@ from ...core.errors import DatasetError
 from ...core.instruction import embed_all
 from ..dataset import Dataset
 from ..storage.remote import Files
-from .cache import INSTRUCTION, ClipCache, Kinds, array_for, further_cameras
+from .cache import INSTRUCTION, ClipCache, Kinds, array_for, episodes_with, further_cameras
 from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 from .windows import Windows
 
@@ -70,7 +70,8 @@ class Clips:
             batch["rgb"]                         # uint8 [32, 16, 96, 128, 3]
             saved = clips.state()                # JSON; Clips(...).resume(saved) goes on with the batch after this one
 
-    A clip never crosses an episode, and an epoch visits every row at which a clip can start once. Channels are those of
+    A clip never crosses an episode, and an epoch visits every row at which a clip can start once. Episodes that have no reading
+    of a channel are left out (`padded`), for their rows hold padding. Channels are those of
     the recorded world ("rgb", "rgb.wrist", "depth", "pose", "health", …); the arrays of the ClipCache ("action",
     "action_valid", "reward", "done", or a vector by its key); "task" (int64, index into `tasks`) and "instruction" (float32
     [D], its embedding); and "episode" and "row" (int64) of each frame. The memory of a batch is reused once neither the
@@ -95,11 +96,16 @@ class Clips:
         else:
             if isinstance(source, Dataset):
                 source = ClipCache.open(source, config.size, progress, further_cameras(source, channels), budget)
-            self._shelf = _Whole(source, order, config.episodes)
+            self._shelf = _Whole(source, order, channels, config.episodes)
         self._keys, self._kinds = self._chosen(channels)
         self._meanings = embed_all(self.tasks)
         self._epoch, self._next = 0, 0
         self._batches(0)
+
+    @property
+    def padded(self) -> tuple[int, ...]:
+        """The episodes that are left out because they have no reading of one of the channels."""
+        return self._shelf.padded
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -220,13 +226,16 @@ class _Whole:
     an epoch. `reading` gives a function `fill(epoch, batch, arrays)`, for batches from `first` of the first epoch on.
     """
 
-    def __init__(self, cache: ClipCache, order: ClipOrder, episodes: Sequence[int] | None):
+    def __init__(self, cache: ClipCache, order: ClipOrder, channels: Sequence[str], episodes: Sequence[int] | None):
         self._order = order
         self._arrays = {name: np.asarray(array) for name, array in cache.arrays.items()}
         self.kinds: Kinds = {name: (array.dtype, array.shape[1:]) for name, array in self._arrays.items()}
         self.keys, self.tasks = cache.keys, cache.tasks
-        self._episodes = episodes_to_read(episodes, len(cache.episodes))
-        first, stop = cache.ranges[slice(None) if episodes is None else self._episodes].T
+        numbers = episodes_to_read(episodes, len(cache.episodes))
+        wanted = [key for name in channels if (key := array_for(name, self._arrays, self.keys))]
+        self._episodes = episodes_with(wanted, numbers, cache.absent)
+        self.padded = tuple(np.setdiff1d(numbers, self._episodes).tolist())
+        first, stop = cache.ranges[self._episodes].T
         self._counts = np.maximum(stop - first - order.span + 1, 0)
         self._starts = ClipStarts.of(first, self._counts)
 

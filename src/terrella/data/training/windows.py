@@ -14,7 +14,17 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ..dataset import Dataset
-from .cache import Kinds, array_for, bytes_a_row, fill_episode, further_cameras, keys_of, kinds_of
+from .cache import (
+    Kinds,
+    absent_of,
+    array_for,
+    bytes_a_row,
+    episodes_with,
+    fill_episode,
+    further_cameras,
+    keys_of,
+    kinds_of,
+)
 from .order import ClipOrder, ClipStarts, copy_rows, episodes_to_read
 
 _FILES, _CLIPS = 1, 2  # the two shuffles of an epoch
@@ -47,7 +57,9 @@ class Windows:
                 "pictures or shorter clips."
             )
         self.dataset, self.size, self.order, self.tasks = dataset, size, order, dataset.tasks
-        self._numbers = episodes_to_read(episodes, len(dataset.episodes))
+        numbers = episodes_to_read(episodes, len(dataset.episodes))
+        self._numbers = episodes_with(self.kinds, numbers, absent_of(dataset))
+        self.padded = tuple(np.setdiff1d(numbers, self._numbers).tolist())
         lengths = (dataset.episodes.stops - dataset.episodes.starts)[self._numbers]
         self._counts = np.maximum(lengths - order.span + 1, 0)
         files = [self.files_of(int(number)) for number in self._numbers]
