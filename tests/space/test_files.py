@@ -169,3 +169,15 @@ def test_colours_of_points_of_any_type(tmp_path, kind):
     scene = read_scene(tmp_path / "a.ply")
     assert torch.allclose(scene.colours, torch.tensor([0.8, 0.4, 0.2]).expand(50, 3), atol=1e-4)
     assert scene.opacities[1] == pytest.approx(0.9) and scene.opacities[0] == pytest.approx(0.18)
+
+
+def test_the_faces_of_a_mesh_are_left_out_by_name(tmp_path):
+    points = b"0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 255 0 0\n"
+    columns = "".join(f"property float {axis}\n" for axis in "xyz") + "".join(
+        f"property uchar {c}\n" for c in ("red", "green", "blue")
+    )
+    faces = "element face 1\nproperty list uchar int vertex_indices\n"
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{columns}{faces}end_header\n"
+    (tmp_path / "mesh.ply").write_bytes(head.encode() + points + b"3 0 1 2\n")
+    with pytest.warns(UserWarning, match="1 faces are left out"):
+        assert len(read_scene(tmp_path / "mesh.ply")) == 3

@@ -14,6 +14,7 @@ from terrella.core.errors import DatasetError
 from terrella.space.camera import FAR_M, rotation
 from terrella.space.fitting import PosedViews
 from terrella.space.pictures import is_pictures, posed_pictures
+from terrella.space.pictures.colmap import read_colmap
 from terrella.space.pictures.posed import to_views
 from terrella.space.pictures.reading import blurred, read_picture, sharpness
 from terrella.space.pictures.transforms import read_transforms
@@ -214,6 +215,50 @@ def test_a_picture_of_another_name_is_not_taken_for_one_that_is_absent(tmp_path)
     )
     saved(tmp_path, "other/3.png")
     assert len(read_transforms(tmp_path).files) == 3
+
+
+def test_blenders_sets_of_pictures_for_training(tmp_path):
+    saved(tmp_path, "train/r_0.png")
+    listed(tmp_path, "./train/r_0")
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    for path in (tmp_path, tmp_path / "transforms_train.json"):
+        assert is_pictures(path) and posed_pictures(path, tmp_path / "work", 9)[0].files == [tmp_path / "train/r_0.png"]
+
+
+def test_lenses_of_each_picture_their_own(tmp_path):
+    saved(tmp_path, "a.png", "b.png")
+    listed(tmp_path, "a.png", "b.png")
+    doc = json.loads((tmp_path / "transforms.json").read_text("utf-8-sig"))
+    doc["frames"][1] |= {"fl_x": 80, "cx": 30, "mask_path": "gone.png", "depth_file_path": "gone too.png"}
+    (tmp_path / "transforms.json").write_text(json.dumps(doc))
+    shots = read_transforms(tmp_path)
+    assert [lens.focal for lens in shots.lenses] == [(60, 60, 32, 24), (80, 80, 30, 24)]
+    assert shots.left_out == (
+        "1 masks (mask_path), which are not read",
+        "1 depth pictures (depth_file_path), which are not read",
+    )
+
+
+def test_models_of_colmap_without_pictures_and_points(tmp_path):
+    pytest.importorskip("pycolmap")
+    model = tmp_path / "sparse" / "0"
+    model.mkdir(parents=True)
+    saved(tmp_path, "images/a/0.png", "images/a/1.png", "images/3.png")
+    names = ("a/0.png", "a\\1.png", "a/2.png", "old/3.png")
+    (model / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    lines = [f"{k + 1} 1 0 0 0 {k} 0 0 1 {name}\n10 10 7\n" for k, name in enumerate(names)]
+    (model / "images.txt").write_text("".join(lines))
+    shots = read_colmap(tmp_path)
+    assert [file.relative_to(tmp_path / "images").as_posix() for file in shots.files] == ["a/0.png", "a/1.png", "3.png"]
+    assert shots.left_out == ("points3D.txt (absent)", "a/2.png (absent)") and not len(shots.points)
+
+
+@pytest.mark.parametrize(("kind", "level"), [("float32", 0.4), ("float32", 102), ("uint16", 0.4 * 65535)])
+def test_brightness_of_pictures_does_not_depend_on_what_they_show(tmp_path, kind, level):
+    for name, bright in (("dim", 0.5), ("bright", 1)):
+        Image.fromarray(np.full((40, 40), level * bright, kind)).save(tmp_path / f"{name}.tif")
+    assert read_picture(tmp_path / "dim.tif").mean() == pytest.approx(51, abs=1)
+    assert read_picture(tmp_path / "bright.tif").mean() == pytest.approx(102, abs=1)
 
 
 def bad_json(folder, doc):

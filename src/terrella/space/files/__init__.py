@@ -43,6 +43,8 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
         if data[:3] == b"ply":
             elements = ply.parse(data)
             scene = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
+            if others := ply.other_elements(data):
+                warnings.warn(f"of its points Gaussians are made; {', '.join(others)} are left out.", stacklevel=2)
             usual = "rdf"
         elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
             scene, usual = spz.decode(data), "rub"

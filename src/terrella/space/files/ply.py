@@ -19,8 +19,23 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 
 
 def parse(data: bytes) -> dict[str, np.ndarray]:
-    """The elements of a PLY (binary or ASCII) as structured arrays, up to the first one with lists (faces), which is left out with
-    all behind it; ValueError for anything else."""
+    """The elements of a PLY (binary or ASCII) as structured arrays, up to the first one with lists (faces); ValueError for anything
+    else."""
+    form, tables, body = _header(data)
+    plain = takewhile(lambda table: all(kind for _, kind in table[2]), tables)
+    kinds = [(name, count, np.dtype(columns)) for name, count, columns in plain]  # ValueError for columns of one name
+    return _rows_of_text(data[body:], kinds) if form == "ascii" else _rows(data, body, kinds)
+
+
+def other_elements(data: bytes) -> list[str]:
+    """Elements of a PLY beside points and what belongs to Gaussians, such as the faces of a mesh, with their numbers."""
+    return [
+        f"{count:,} {name}s" for name, count, _ in _header(data)[1] if count and name not in ("vertex", "chunk", "sh")
+    ]
+
+
+def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:
+    """The format; name, number and columns of each element, with types ("" for lists); and where the header ends."""
     mark = re.search(rb"end_header[ \t]*\r?\n?", data[:LONGEST_HEADER])
     if mark is None:
         raise ValueError("its header has no end")
@@ -40,9 +55,7 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
             if len(words) != 3 or words[1] not in _TYPES or not tables or len(tables[-1][2]) >= 1000:
                 raise ValueError(f"its property line '{' '.join(words)[:80]}' is not understood")
             tables[-1][2].append((words[2], _ORDERS[form] + _TYPES[words[1]]))
-    plain = list(takewhile(lambda table: all(kind for _, kind in table[2]), tables))
-    kinds = [(name, count, np.dtype(columns)) for name, count, columns in plain]  # ValueError for columns of one name
-    return _rows_of_text(data[mark.end() :], kinds) if form == "ascii" else _rows(data, mark.end(), kinds)
+    return form, tables, mark.end()
 
 
 def _rows(data: bytes, at: int, kinds: list[tuple[str, int, np.dtype]]) -> dict[str, np.ndarray]:
@@ -103,18 +116,20 @@ def columns(rows: np.ndarray, *names: str) -> torch.Tensor:
 
 
 def shares(rows: np.ndarray, *names: str) -> torch.Tensor:
-    """Colours or opacities [n, names] in 0..1, whatever their type. Full are 1, 255 or 65,535 of floats, and 255, 65,535 or the
-    largest number of their type of integers: the first that holds all values."""
-    values, kind = columns(rows, *names), rows.dtype[names[0]]
-    most = float(values.nan_to_num(0, 0, 0).amax())
+    """Colours or opacities [n, names] in 0..1, whatever their type."""
+    values = columns(rows, *names)
+    return (values / full_scale(rows.dtype[names[0]], float(values.nan_to_num(0, 0, 0).amax()))).clamp(0, 1)
+
+
+def full_scale(kind: np.dtype, most: float) -> float:
+    """The number that stands for full brightness where `most` is the largest: the first that is as large of 1, 255 and 65,535
+    (floats), or of 255, 65,535 and the largest number of the type (integers)."""
     if kind.kind == "f":
-        full = next(
+        return next(
             (level for level in (1.0, 255.0, 65535.0) if most <= 1.5 * level), most
         )  # some are slightly too bright
-    else:
-        largest = float(np.iinfo(kind).max)
-        full = next(level for level in (255.0, min(65535.0, largest), largest) if most <= level)
-    return (values / full).clamp(0, 1)
+    largest = float(np.iinfo(kind).max)
+    return next(level for level in (255.0, min(65535.0, largest), largest) if most <= level)
 
 
 def encode(gaussians: Gaussians) -> bytes:

@@ -17,19 +17,19 @@ LONGEST = 1600  # pixels of pictures whose poses are looked for
 def is_pictures(path: Path) -> bool:
     """Whether a path is a video or a folder of pictures, posed or not, and not a recording."""
     if path.is_file():
-        return path.suffix.lower() in VIDEOS or path.name == transforms.FILE
+        return path.suffix.lower() in VIDEOS or transforms.file_of(path) is not None
     recorded = (path / "meta" / "info.json").exists()
     return (
         path.is_dir()
         and not recorded
-        and ((path / transforms.FILE).exists() or colmap.model_of(path) is not None or bool(_pictures(path)))
+        and (transforms.file_of(path) is not None or colmap.model_of(path) is not None or bool(_pictures(path)))
     )
 
 
 def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str]]:
     """At most `frames` pictures with poses, and what was left out, by name. Missing poses are computed by COLMAP; pictures and
     model stay in `work` for the next call."""
-    if path.name == transforms.FILE or (path / transforms.FILE).exists():
+    if transforms.file_of(path) is not None:
         shots, out = transforms.read_transforms(path), []
     elif path.is_dir() and colmap.model_of(path) is not None:
         shots, out = colmap.read_colmap(path), []

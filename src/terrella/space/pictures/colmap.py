@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -37,8 +38,10 @@ def read_colmap(folder: Path) -> Shots:
     colmap, model = _pycolmap(), model_of(folder)
     if model is None:
         raise DatasetError(f"{folder} has no model of COLMAP (sparse/0/cameras.bin); give the folder that holds one.")
+    left_out: list[str] = []
     try:
-        model_data = colmap.Reconstruction(str(model))
+        with TemporaryDirectory() as work:
+            model_data = colmap.Reconstruction(str(_with_points(model, Path(work), left_out)))
     except (RuntimeError, ValueError, MemoryError) as error:
         raise DatasetError(f"{model} cannot be read as a model of COLMAP; make it again.") from error
     lenses = {number: _lens(camera) for number, camera in model_data.cameras.items()}
@@ -60,8 +63,20 @@ def read_colmap(folder: Path) -> Shots:
     points = np.array([point.xyz for point in model_data.points3D.values()], np.float32).reshape(-1, 3)
     points = torch.from_numpy(points[np.isfinite(points).all(1)])
     files, own = [file for _, file in kept], [lenses[image.camera_id] for image, _ in kept]
-    missing = tuple(absent(image.name) for image, file in located if file is None)
-    return levelled(Shots(files, own, torch.stack(poses), points, False, missing))
+    left_out += [absent(image.name) for image, file in located if file is None]
+    return levelled(Shots(files, own, torch.stack(poses), points, False, tuple(left_out)))
+
+
+def _with_points(model: Path, work: Path, left_out: list[str]) -> Path:
+    """The model, or its copy in `work` with no points if their file is absent, which pycolmap refuses."""
+    name = "points3D.bin" if (model / "cameras.bin").is_file() else "points3D.txt"
+    if (model / name).is_file():
+        return model
+    left_out.append(absent(name))
+    for file in model.glob(f"*{name[-4:]}"):
+        shutil.copy(file, work)
+    (work / name).write_bytes(bytes(8) if name.endswith("bin") else b"")
+    return work
 
 
 def _lens(camera: Any) -> Lens:

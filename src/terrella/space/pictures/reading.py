@@ -8,6 +8,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ...core.errors import DatasetError
 from ...core.video import film_of, media_address, square_width
+from ..files.ply import full_scale
 
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
@@ -47,10 +48,10 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
 
 
 def _rgb(picture: Image.Image) -> Image.Image:
-    """Any mode as RGB: 16 bits scaled to 8, transparency on black."""
+    """Any mode as RGB: 16 bits and floats by their full scale, transparency on black."""
     if picture.mode.startswith(("I", "F")):
-        numbers = np.asarray(picture).astype(np.float64)
-        most = 65535 if picture.mode.startswith("I") and numbers.max() > 255 else max(float(numbers.max()), 1e-9)
+        numbers = np.nan_to_num(np.asarray(picture), posinf=0, neginf=0)
+        most = full_scale(numbers.dtype, float(numbers.max()))
         picture = Image.fromarray((numbers.clip(0, most) * (255 / most)).round().astype(np.uint8))
     if "A" in picture.mode or "transparency" in picture.info:
         clear = picture.convert("RGBA")

@@ -13,14 +13,19 @@ from .locating import locate
 from .posed import Lens, Shots, absent, pose_of
 from .reading import read_picture
 
-FILE = "transforms.json"
+FILES = ("transforms.json", "transforms_train.json")  # the latter in Blender's sets
 _BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 
 
+def file_of(path: Path) -> Path | None:
+    """The list of pictures that a path is, or that lies in it."""
+    return next((file for name in FILES if (file := path / name).is_file()), path if path.name in FILES else None)
+
+
 def read_transforms(path: Path) -> Shots:
     """The posed pictures of a transforms.json, or of its folder, without those that are absent; DatasetError for a broken one."""
-    path = path / FILE if path.is_dir() else path
+    path = file_of(path) or path
     try:
         doc = json.loads(path.read_text("utf-8-sig"))
         frames = list(doc["frames"])
