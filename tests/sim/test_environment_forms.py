@@ -9,6 +9,7 @@ import torch
 from gymnasium import spaces
 from PIL import Image
 
+from terrella.care.doctor import examine
 from terrella.core import check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.core.instruction import bytes_to_text, embed, text_to_bytes
@@ -223,7 +224,7 @@ def test_ten_entries_go_in_and_each_comes_out_or_is_named(tmp_path):
     assert (seen["rgb"] == torch.from_numpy(RGB)).all()
     said = " ".join(describe(world.spec))
     assert "Left out: crowd (a Sequence), none (it is empty), secret (its space does not declare it), " in said
-    assert "goal/hint (a text beside that of the task), info.success (no channel reads it)." in said
+    assert "goal/hint (a text beside that of the task), info.success (no channel reads it; an adapter can)." in said
     assert "The task of each episode: the text 'goal/mission'." in said
     assert (
         "walker/height is walker_height" in said and "numbers is seen_numbers" in said and "camera/front is rgb" in said
@@ -234,6 +235,7 @@ def test_ten_entries_go_in_and_each_comes_out_or_is_named(tmp_path):
     dataset = Dataset(tmp_path / "r")
     tasks = {take.task for take in dataset.source().takes()}
     assert tasks == {"go to the red bäll", "go to the blau bäll"}
+    assert "left out when it was recorded: crowd (a Sequence)" in examine(tmp_path / "r").notes
     kept = set(dataset.about["channels"])
     assert kept == channels - {"text", "instruction"} and set(dataset.world["left_out"]) >= {
         "crowd",

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ..core.errors import DatasetError
+from ..core.losses import by_reason
 from ..data.channels import DONE
 from ..data.format import INFO, STATS
 from ..data.storage import journal, mp4
@@ -74,6 +75,8 @@ def examine(root: str | Path) -> Examination:
     faults += _duplicates(folder, rows, shown)
     still, notes = constant_columns(folder, rows)
     notes += _padding(folder)
+    left_out = folder.world.get("left_out")
+    notes += [f"left out when it was recorded: {line}" for line in by_reason(left_out)]
     faults += [*still, *frozen_states(folder, rows, shown.static), *check_alignment(folder, rows, shown)]
     if busy:
         notes.append("a recorder is writing to this folder now; the episode that it is recording was not examined")

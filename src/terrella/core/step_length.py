@@ -59,7 +59,7 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
     chosen, seconds = next(iter((measured or stated).items()))
     others = {name: other for name, other in stated.items() if not math.isclose(other, seconds, rel_tol=0.02)}
     differing = [f"by its {name} it would be {1 / other:g}" for name, other in others.items()]
-    return seconds, "; ".join([f"its {chosen}", *differing, *remark])
+    return seconds, "; ".join([f"its {chosen}", *differing, *(["--fps sets another"] if differing else []), *remark])
 
 
 def _measured(env: gymnasium.Env) -> dict[str, float]:

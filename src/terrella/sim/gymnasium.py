@@ -150,7 +150,9 @@ class GymnasiumWorld:
         self._drawn = DrawnPictures()
         self._rgb_size, why = self._picture_size(seen) if rgb else (None, "")
         left_out = self._parts.left_out | ({"pictures": why} if why else {})
-        left_out |= {f"info.{key}": "no channel reads it" for key in info if key not in self._used_infos()}
+        left_out |= {
+            f"info.{key}": "no channel reads it; an adapter can" for key in info if key not in self._used_infos()
+        }
         self.spec = self._describe(facts_of(self._env, adapter.action_names), config.dt_s, left_out)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..core.losses import by_reason
 from ..core.spec import BUTTONS, CHOICE, Spec, can_idle, neutral_action
 from .progress import Progress
 
@@ -20,7 +21,6 @@ def describe(spec: Spec) -> list[str]:
     how = spec.card.get("how")
     chosen = lambda what: f" ({how[what]})" if isinstance(how, Mapping) and what in how else ""  # noqa: E731
     drawn, names = spec.channels.get("rgb"), spec.action_names
-    fps = " (--fps)" if isinstance(how, Mapping) and ";" in str(how.get("frame rate")) else ""
     height, width = (drawn.shape or (0, 0))[:2] if drawn is not None else (0, 0)
     limit = f"{LONGEST:,} steps, as none is declared"
     if spec.max_episode_steps:
@@ -30,7 +30,7 @@ def describe(spec: Spec) -> list[str]:
     return [
         f"{spec.name}: pictures of {height}x{width}{chosen('pictures')} (--size)" if drawn is not None else
         f"{spec.name} shows no pictures: the recording holds numbers only, and no world that draws can be trained on it.",
-        f"{1 / spec.dt_s:g} steps a second{chosen('frame rate')}{fps}; episodes of up to {limit}.",
+        f"{1 / spec.dt_s:g} steps a second{chosen('frame rate')}; episodes of up to {limit}.",
         f"Actions: {', '.join(names) or spec.action}{chosen('action names')}; at rest: "
         + (rest if can_idle(spec) else f"{rest}, as none is declared to do nothing (--idle)"),
         f"Keys: {keys or 'none (--keys)'}{chosen('keys')}",
@@ -47,13 +47,12 @@ def _observed(spec: Spec) -> list[str]:
     names = dict(renamed) if isinstance(renamed, Mapping) else {}
     features = features_of(spec.recorded).items()
     names |= {channel: feature for channel, feature in features if "observation.pose" != feature != feature_of(channel)}
-    left = dict(left_out) if isinstance(left_out, Mapping) else {}
     channels = [name for name in spec.channels if name not in ("text", "instruction")]
     return [
         *([f"Channels: {', '.join(channels)}."] if isinstance(how, Mapping) else []),
         *([f"The task of each episode: {task}."] if task else []),
         *([f"Names: {', '.join(f'{name} is {now}' for name, now in names.items())}."] if names else []),
-        *([f"Left out: {', '.join(f'{name} ({why})' for name, why in left.items())}."] if left else []),
+        *([f"Left out: {', '.join(lost)}."] if (lost := by_reason(left_out)) else []),
     ]
 
 

@@ -47,7 +47,7 @@ def from_env(
     )
     sensors, notes = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
     if ";" in clock and fps is None:
-        notes.append(f"{name} has {stated['fps']:g} steps a second by {clock}; give fps to correct that.")
+        notes.append(f"the step length of {name} is {clock}.")
     if infos:
         notes.append(f"the infos of {name} are left out ({', '.join(map(str, infos))}).")
     odd = [place for place, leaf in leaves.items() if leaf and place not in sensors]
