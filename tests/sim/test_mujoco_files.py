@@ -11,6 +11,7 @@ import torch
 from terrella.core import check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.library import load
+from terrella.workflows.recording_facts import describe
 
 if find_spec("mujoco") is None:
     pytest.skip("mujoco is not installed: pip install 'terrella[mujoco]'", allow_module_level=True)
@@ -49,6 +50,7 @@ def test_a_lens_is_that_with_which_it_is_drawn(tmp_path, camera):
     lens = LENSES[camera]
     if lens is None:
         assert not world.spec.cameras and "eye is no pinhole" in world.spec.card["notes"][0]
+        assert any("Note: camera eye" in line for line in describe(world.spec))
     else:
         assert world.spec.cameras["rgb"].intrinsics == pytest.approx(lens, abs=1e-4)
     check_world(world, steps=1)
@@ -93,6 +95,7 @@ SERVOS = {  # actuator: joints' limits, low, high, and why
     '<position tendon="both" kp="9"/>': ('range="-90 90"', 'range="-.2 .5"', -np.pi - 0.5, np.pi + 0.2, "its range"),
     '<position site="tip" refsite="base" gear="1 0 0 0 0 0" kp="9"/>': ("", "", -1, 1, "nothing limits it"),
     '<general joint="swing" gainprm="4" biastype="affine" biasprm="2 -8 -1"/>': ('range="-1 1" limited="true"', "", None, None, ""),
+    '<position joint="swing" kp="9" ctrllimited="false" ctrlrange="-.3 .2"/>': ("", "", -0.3, 0.2, "its range, which"),
     '<motor joint="swing" gear="5" forcerange="-30 20"/>': ("", "", -30, 20, "its force range"),
     '<motor joint="swing" gear="5"/>': ('actuatorfrcrange="-30 20"', "", -6, 4, "its force range"),
     '<motor joint="swing" gear="50"/>': ("", "", -1, 1, "its gear"),
@@ -113,7 +116,7 @@ def test_controls_without_limits_get_those_of_what_they_move(tmp_path, servo):
         low, high = sorted((8 * q - 2) / 4 for q in np.radians([-1, 1]))
         why = "its range"
     assert (box.low.tolist(), box.high.tolist()) == (pytest.approx([low], rel=1e-5), pytest.approx([high], rel=1e-5))
-    assert f"({why})" in world.spec.card["notes"][0]
+    assert f"({why}" in world.spec.card["notes"][0]
 
 
 HOME = '<keyframe><key name="home" qpos="{}"{}/></keyframe>'

@@ -44,7 +44,9 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
     rest = model.key_ctrl[0].copy() if model.nkey and model.key_ctrl[0].any() else np.where(servo, hold, 0.0)
     limits, chosen = model.actuator_ctrlrange.copy(), []
     for at in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)).tolist():
-        limits[at], why = _limits(model, data, at, kinds[at])
+        why = "its range, which the file does not enforce"
+        if limits[at, 0] == limits[at, 1]:
+            limits[at], why = _limits(model, data, at, kinds[at])
         low, high = limits[at] = min(limits[at, 0], rest[at]), max(limits[at, 1], rest[at])
         chosen.append(
             f"{control_name(model, at)} {low:.4g} to {high:.4g} {control_unit(model, at)}".rstrip() + f" ({why})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,7 +42,7 @@ def _observed(spec: Spec) -> list[str]:
     """Lines on the channels of an environment, on the names that were changed, and on what is in no channel."""
     from ..data.channels import feature_of, features_of
 
-    how, renamed, left_out = (spec.card.get(name) for name in ("how", "renamed", "left_out"))
+    how, renamed, left_out, notes = (spec.card.get(name) for name in ("how", "renamed", "left_out", "notes"))
     task = how.get("task") if isinstance(how, Mapping) else None
     names = dict(renamed) if isinstance(renamed, Mapping) else {}
     features = features_of(spec.recorded).items()
@@ -53,6 +53,7 @@ def _observed(spec: Spec) -> list[str]:
         *([f"The task of each episode: {task}."] if task else []),
         *([f"Names: {', '.join(f'{name} is {now}' for name, now in names.items())}."] if names else []),
         *([f"Left out: {', '.join(lost)}."] if (lost := by_reason(left_out)) else []),
+        *(f"Note: {note}." for note in (notes if isinstance(notes, Sequence) else ())),
     ]
 
 

@@ -159,6 +159,8 @@ def _scene(file: Gltf, nodes: list, parts: list, places: dict[int, np.ndarray]) 
         left_out.append(f"{len(parts) - len(solid)} meshes of points or lines")
     if file.about.get("animations"):
         left_out.append("animations")
+    if (others := len(file.about.get("scenes", [])) - 1) > 0:
+        left_out.append(f"{others} scenes that are not shown at first")
     abouts, names, numbers = file.about.get("materials", []), list[str](), dict[int, int]()
     corners, material, things = [], [], []
     for node, matrix, part in solid:

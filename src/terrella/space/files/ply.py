@@ -86,9 +86,8 @@ def decode(elements: dict[str, np.ndarray]) -> Gaussians:
         raise ValueError("it holds no points")
     means = columns(rows, "x", "y", "z")
     if "scale_0" not in (rows.dtype.names or ()):
-        names = rows.dtype.names or ()
-        colours = shares(rows, *next((three for three in _COLOURS if set(three) <= set(names)), _COLOURS[0]))
-        solid = shares(rows, "alpha")[:, 0] if "alpha" in names else torch.ones(len(rows))
+        colours = _colours(rows)
+        solid = shares(rows, "alpha")[:, 0] if "alpha" in (rows.dtype.names or ()) else torch.ones(len(rows))
         solid = solid if solid.any() else torch.ones(len(rows))  # some tools leave it 0
         spread = (means.amax(0) - means.amin(0)).norm() / max(len(rows), 1) ** 0.5
         scales = torch.full((len(rows), 3), float(spread) * 0.4)
@@ -98,7 +97,8 @@ def decode(elements: dict[str, np.ndarray]) -> Gaussians:
     many = {0: 1, 9: 4, 24: 9, 45: 16}.get(len(rest))
     if many is None:
         raise ValueError(f"it has {len(rest)} numbers of harmonics besides the first, and not 0, 9, 24 or 45")
-    sh = columns(rows, "f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    bare = "f_dc_0" not in (rows.dtype.names or ())
+    sh = plain_sh(_colours(rows)) if bare else columns(rows, "f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     if rest:
         more = columns(rows, *(f"f_rest_{k}" for k in range(len(rest)))).view(len(rows), 3, many - 1).transpose(1, 2)
         sh = torch.cat([sh, more], 1)
@@ -113,6 +113,11 @@ def columns(rows: np.ndarray, *names: str) -> torch.Tensor:
         raise KeyError(", ".join(missing))
     with np.errstate(over="ignore", invalid="ignore"):
         return torch.from_numpy(np.stack([rows[name].astype(np.float32) for name in names], 1))
+
+
+def _colours(rows: np.ndarray) -> torch.Tensor:
+    """Colours of points in 0..1 [n, 3]; KeyError where there are none."""
+    return shares(rows, *next((three for three in _COLOURS if set(three) <= set(rows.dtype.names or ())), _COLOURS[0]))
 
 
 def shares(rows: np.ndarray, *names: str) -> torch.Tensor:
