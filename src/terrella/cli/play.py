@@ -1,27 +1,41 @@
 """The command `terrella play`: a world, or a game and a world side by side, on a page in the browser."""
 
+import shlex
+import sys
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
 from ..core.world import World
 from ..serve import ServeConfig
 from ..workflows import play as workflow
+from ..workflows import start
 from ..workflows.opening import ControlsConfig
-from .say import Host, Json, Port, Seed, Token, WorldName, result, say
+from .say import Host, Json, Port, Token, result, say
+
+AnyWorld = Annotated[Positional[str | None], arg(metavar="WORLD")]
+FirstSeed = Annotated[int | None, arg(help="Seed of the first episode. Default: one that begins with a good view.")]
 
 
 def play(
-    name: WorldName,
     controls: ControlsConfig,
     config: workflow.PlayConfig,
+    name: AnyWorld = None,
     port: Port = 8765,
     host: Host = "127.0.0.1",
     token: Token = None,
-    seed: Seed = 0,
+    seed: FirstSeed = None,
     json: Json = False,
 ) -> None:
-    """Play a world in the browser: a learned world or a real game.
+    """Play a world in the browser: a learned world or a real game. Without a name, a page to choose from.
 
     Args:
         name: A name of `terrella list`, the path of a checkpoint or run, or an environment (gym:ID).
     """
+    page = ServeConfig(host, port, token, seed, command=shlex.join(["terrella", *sys.argv[1:]]))
+
+    def begun(address: str) -> None:
+        result({"address": address}, json, f"Choose a world: open {address}")
 
     def ready(address: str, worlds: list[World]) -> None:
         names = [world.spec.name for world in worlds]
@@ -29,4 +43,7 @@ def play(
         if worlds[-1].spec.card.get("kind") == "splat":
             say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
 
-    workflow.play(name, config, controls, ServeConfig(host, port, token, seed), on_ready=ready, progress=say)
+    if name is None:
+        start.start(config, controls, page, on_ready=begun, progress=say)
+    else:
+        workflow.play(name, config, controls, page, on_ready=ready, progress=say)

@@ -17,15 +17,17 @@ from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h11
 import uvicorn
 from starlette.applications import Starlette
+from starlette.datastructures import State
 from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route
+from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..core.errors import ServeError, TerrellaError
@@ -132,8 +134,16 @@ async def posted(request: Request, most: int) -> bytes:
     return content
 
 
+class PageApplication(Protocol):
+    """The ASGI application of a page. Its state gets `on_ready`, which it calls once it can be opened."""
+
+    state: State
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None: ...
+
+
 def make_server(
-    app: Starlette,
+    app: PageApplication,
     listener: socket.socket,
     host: str,
     token: str | None,
@@ -153,7 +163,7 @@ def make_server(
 
 
 def serve_page(
-    build: Callable[[str | None], Starlette],
+    build: Callable[[str | None], PageApplication],
     host: str,
     port: int,
     token: str | None,

@@ -41,7 +41,7 @@ class ServeConfig:
     host: str = "127.0.0.1"  # the address to listen on
     port: int = 8765  # 0 picks a free one
     token: str | None = None  # a secret that the page's address must contain
-    seed: int = 0  # of each session's first episode
+    seed: int | None = 0  # of each session's first episode; None lets `terrella play` choose a good view
     seats: int = 4  # sessions at once; a world that cannot fork has one
     grace_s: float = 120.0  # how long a session outlives its socket
     idle_s: float = 1800.0  # how long a silent, paused session keeps its seat
@@ -71,7 +71,7 @@ class Sessions:
         check_playable(worlds)
         self.worlds, self.config = tuple(worlds), config or ServeConfig()
         self._sink_factory, self._agents = sink_factory, agents_of(policy)
-        seed, budgets = self.config.seed, (self.config.history_s, self.config.state_mb)
+        seed, budgets = self.config.seed or 0, (self.config.history_s, self.config.state_mb)
         self._book = KeyBook(worlds[0].spec, keep, kept_in)
         self._make_timeline = lambda: Timeline(
             self.worlds, seed, sink_factory, picture, self._agents, *budgets, keys=self._book.spec
@@ -169,6 +169,8 @@ def _describe(world: World, label: str) -> dict:
 
 def build_app(sessions: Sessions, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application."""
+    # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
+    torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
 
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -279,7 +281,5 @@ def serve(
     sessions = Sessions(
         worlds, config, sink_factory=sink_factory, picture=picture, policy=policy, keep=keep, kept_in=kept_in
     )
-    # Half of the cores are the browser's: threads that wait for one another on a shared core lose a third of the frames.
-    torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 2) // 2)))
     build = lambda token: build_app(sessions, config.host, token)  # noqa: E731
     serve_page(build, config.host, config.port, config.token, on_ready, websockets=True)

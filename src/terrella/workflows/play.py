@@ -1,9 +1,11 @@
 """Serves the page of a world, or of a game and a learned world side by side, with an agent that may drive."""
 
+import math
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -11,6 +13,7 @@ from .. import library
 from ..act.explorer import Explorer
 from ..core.errors import ServeError, TerrellaError
 from ..core.policy import Policy, Random
+from ..core.spec import neutral_action
 from ..core.world import World, make_rng
 from ..data import Layout, Recorder
 from ..serve import ServeConfig, SinkFactory, read_picture, serve
@@ -20,6 +23,9 @@ from .key_keeper import KeyKeeper
 from .opening import ControlsConfig, Device, Fast, load_named
 from .page_agents import PageAgents
 from .progress import Progress, silent
+
+FIRST_SEEDS = 12  # of which the one with the best first view is taken
+PEOPLE_SIZES = (480, 640), (240, 320)  # of pictures that are drawn for people, where the machine is quick enough
 
 
 @dataclass(frozen=True)
@@ -63,21 +69,80 @@ def play(
     name:     as `terrella list` shows it, or the path of a checkpoint.
     on_ready: called with the address to open, and the worlds on the page, the learned world last.
     """
+    worlds, page, options = prepared(name, config, controls, page, progress)
+    serve(worlds, page, **options, on_ready=lambda address: on_ready and on_ready(address, worlds))
+
+
+def prepared(
+    name: str,
+    config: PlayConfig | None = None,
+    controls: ControlsConfig | None = None,
+    page: ServeConfig | None = None,
+    progress: Progress = silent,
+) -> tuple[list[World], ServeConfig, dict[str, Any]]:
+    """The worlds of a page, its settings, and the further arguments of serve.Sessions."""
     config, controls, page = config or PlayConfig(), controls or ControlsConfig(), page or ServeConfig()
     _check(config)
-    learned = load_named(
-        name, config.device, config.memory, config.fast, progress=progress, remember=config.remember,
-        estimator=config.estimator, memory_mb=config.memory_mb, randomise=config.randomise,
-    )  # fmt: skip
+    learned = _loaded(name, config, progress)
     picture = None if config.image is None else _first_picture(config.image, learned)
     worlds = [_game_beside(learned, config.truth, progress), learned] if config.compare else [learned]
     worlds = [controls.of(world) for world in worlds]
     folder = library.folder_for_keys(name) if is_loopback(page.host) and not config.compare else None
     keeper = KeyKeeper(worlds[0].spec, folder, learned.spec)
-    serve(
-        worlds, page, policy=_driver(worlds, config), picture=picture, sink_factory=_sink(worlds[0], keeper, config.record),
-        keep=keeper, kept_in=keeper.place, on_ready=lambda address: on_ready and on_ready(address, worlds),
-    )  # fmt: skip
+    options = {
+        "policy": _driver(worlds, config), "picture": picture, "sink_factory": _sink(worlds[0], keeper, config.record),
+        "keep": keeper, "kept_in": keeper.place,
+    }  # fmt: skip
+    if page.seed is None:
+        page = replace(page, seed=0 if config.compare else first_seed(learned))
+    return worlds, page, options
+
+
+def _loaded(name: str, config: PlayConfig, progress: Progress) -> World:
+    """The world. The pictures of a robot are large, for people, unless they are recorded or the machine draws them too slowly."""
+    options: dict[str, Any] = {
+        "progress": progress, "remember": config.remember, "estimator": config.estimator, "memory_mb": config.memory_mb,
+        "randomise": config.randomise,
+    }  # fmt: skip
+    if name.startswith("mujoco:") and config.record is None and not config.agent:
+        for size in PEOPLE_SIZES:
+            world = load_named(name, config.device, config.memory, config.fast, size=size, **options)
+            if "rgb" not in world.spec.channels or _drawing_s(world) < world.spec.dt_s:
+                return world
+    return load_named(name, config.device, config.memory, config.fast, **options)
+
+
+def _drawing_s(world: World) -> float:
+    """Seconds to draw a picture; of three the quickest."""
+    state, took = world.start(1, make_rng(0)), []
+    for _ in range(3):
+        state = world.imagine(state, torch.as_tensor(neutral_action(world.spec))[None], make_rng(0))
+        began = time.perf_counter()
+        world.render(state, ("rgb",))
+        took.append(time.perf_counter() - began)
+    return min(took)
+
+
+def first_seed(world: World) -> int:
+    """The seed whose episode begins with a good view: that on a learned world's card, else of a few the one with the widest and
+    most varied view. 0 for other worlds."""
+    named, spec = world.spec.card.get("seed"), world.spec
+    if isinstance(named, int):
+        return named
+    if spec.card.get("kind") not in ("learned", "latent") or "rgb" not in spec.channels:
+        return 0
+    return max(range(FIRST_SEEDS), key=lambda seed: _variety(world, seed))
+
+
+@torch.inference_mode()
+def _variety(world: World, seed: int) -> float:
+    """The entropy of the colours of the first picture of an episode, in nats; times the logarithm of its median depth, if any."""
+    names = [name for name in ("rgb", "depth") if name in world.spec.channels]
+    seen = world.render(world.start(1, make_rng(seed)), names)
+    colours = (seen["rgb"][0].cpu() // 32).long() @ torch.tensor([64, 8, 1])
+    shares = torch.bincount(colours.flatten(), minlength=512) / colours.numel()
+    entropy = float(-(shares * shares.clamp_min(1e-9).log()).sum())
+    return entropy * math.log1p(float(seen["depth"].median())) if "depth" in seen else entropy
 
 
 def _check(config: PlayConfig) -> None:

@@ -1,0 +1,146 @@
+"""The start page: cards of worlds, places and recordings, and one server that shows whichever of them a person opens."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import Receive, Scope, Send
+
+from ..core.errors import ServeError, TerrellaError
+from .http_server import WEB, application, posted, serve_page
+
+MOST_WORDS = 4096  # bytes of a request
+Build = Callable[[str, str | None], Starlette]  # (host, token) -> the application of a page
+
+
+@dataclass(frozen=True)
+class StartCard:
+    """Something that can be opened."""
+
+    name: str  # by which it is opened
+    title: str
+    section: str  # "bundled", "world", "place", "recording" or "game"
+    text: str  # a sentence
+
+
+class Shelf(Protocol):
+    """What the start page offers. One thread calls `thumbnail`, another the rest; each may raise a TerrellaError."""
+
+    def cards(self) -> list[StartCard]: ...
+
+    def thumbnail(self, name: str) -> bytes:
+        """A JPEG of a card."""
+        ...
+
+    def open(self, name: str) -> Build:
+        """The page of a card."""
+        ...
+
+    def build(self, words: str) -> str:
+        """Builds the place that the words describe; returns its name."""
+        ...
+
+
+class StartPage:
+    """An ASGI application: the start page at /start, and at / the page that was opened last. It shows one at a time, because each
+    uses the machine for itself."""
+
+    def __init__(self, shelf: Shelf, host: str = "127.0.0.1", token: str | None = None):
+        self._shelf, self._host, self._token = shelf, host, token
+        self._worker, self._painter = (
+            ThreadPoolExecutor(1, thread_name_prefix=name) for name in ("start", "thumbnails")
+        )
+        self._lock = asyncio.Lock()
+        self._thumbnails: dict[str, bytes] = {}
+        self._open: Starlette | None = None
+        self._running = contextlib.AsyncExitStack()
+        self._page = application("start/index.html", self._routes(), self._lifespan, host, token)
+        self.state = self._page.state
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        start = self._open is None or scope["type"] == "lifespan" or scope["path"].startswith("/start")
+        await (self._page if start or self._open is None else self._open)(scope, receive, send)
+
+    def _routes(self) -> list[Route]:
+        show = Response((WEB / "start/index.html").read_bytes(), media_type="text/html")
+        return [
+            Route("/start", lambda request: show),
+            Route("/start/cards", self._cards),
+            Route("/start/thumbnail", self._thumbnail),
+            Route("/start/open", self._opens, methods=["POST"]),
+            Route("/start/build", self._builds, methods=["POST"]),
+        ]
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
+        try:
+            yield
+        finally:
+            await self._running.aclose()
+            for worker in (self._worker, self._painter):
+                worker.shutdown(cancel_futures=True)
+
+    async def _cards(self, request: Request) -> Response:
+        return JSONResponse([asdict(card) for card in await self._work(self._shelf.cards)])
+
+    async def _thumbnail(self, request: Request) -> Response:
+        name = request.query_params.get("name", "")
+        try:
+            if name not in self._thumbnails:
+                paint = lambda: self._shelf.thumbnail(self._known(name))  # noqa: E731
+                self._thumbnails[name] = await asyncio.get_running_loop().run_in_executor(self._painter, paint)
+            return Response(self._thumbnails[name], media_type="image/jpeg")
+        except Exception as error:  # a card without a picture is a card all the same
+            return PlainTextResponse(str(error), 404)
+
+    async def _opens(self, request: Request) -> Response:
+        return await self._answer(request, "name", self._known)
+
+    async def _builds(self, request: Request) -> Response:
+        return await self._answer(request, "words", self._shelf.build)
+
+    async def _answer(self, request: Request, field: str, name_of: Callable[[str], str]) -> Response:
+        """Opens what a POST names, or what is made of its words; the page goes to / then."""
+        try:
+            text = json.loads(await posted(request, MOST_WORDS))[field]
+            if not isinstance(text, str) or not text.strip():
+                raise ServeError("the start page sends a name or words; reload it.")
+            async with self._lock:
+                build = await self._work(lambda: self._shelf.open(name_of(text)))
+                await self._show(build(self._host, self._token))
+        except (ValueError, KeyError, TypeError, RecursionError):
+            return PlainTextResponse("the start page sends a name or words; reload it.", 422)
+        except TerrellaError as error:
+            return PlainTextResponse(str(error), 422)
+        return JSONResponse({})
+
+    async def _show(self, app: Starlette) -> None:
+        """Ends the page that is open, and begins this one."""
+        self._open = None
+        await self._running.aclose()
+        app.state.on_ready = lambda: None
+        await self._running.enter_async_context(app.router.lifespan_context(app))
+        self._open = app
+
+    def _known(self, name: str) -> str:
+        if name not in {card.name for card in self._shelf.cards()}:
+            raise ServeError(f"'{name[:60]}' is not on the start page any more; reload it.")
+        return name
+
+    def _work(self, function: Callable, *arguments):
+        return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
+
+
+def serve_start(
+    shelf: Shelf, host: str, port: int, token: str | None, on_ready: Callable[[str], None] | None = None
+) -> None:
+    """Serves the start page, and the pages that are opened from it, until interrupted. Arguments as for `serve_page`."""
+    serve_page(lambda token: StartPage(shelf, host, token), host, port, token, on_ready, websockets=True)

@@ -1,0 +1,166 @@
+"""The start page: cards, thumbnails, one page at a time at the same address, and the way back."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import threading
+import urllib.error
+import urllib.request
+from types import SimpleNamespace
+
+import pytest
+from PIL import Image
+
+from terrella.core.errors import TerrellaError
+from terrella.serve import ServeConfig
+from terrella.serve.http_server import make_server, open_port
+from terrella.serve.server import Sessions, build_app
+from terrella.serve.start_page import StartCard, StartPage
+from terrella.workflows.opening import ControlsConfig
+from terrella.workflows.play import PlayConfig, first_seed
+from terrella.workflows.progress import silent
+from terrella.workflows.start import FolderShelf
+
+from .panorama import Panorama
+from .test_page import open_page, until  # noqa: F401  (a fixture)
+
+
+class Drawer:
+    """Two panoramas of different names, and words."""
+
+    def __init__(self):
+        self.built: list[str] = []
+
+    def cards(self):
+        return [StartCard(name, name.title(), "bundled", "A view.") for name in ("hills", "broken", *self.built)]
+
+    def thumbnail(self, name):
+        data = io.BytesIO()
+        Image.new("RGB", (8, 6), (9, 99, 9)).save(data, "JPEG")
+        return data.getvalue()
+
+    def open(self, name):
+        if name == "broken":
+            raise TerrellaError("broken cannot be opened; choose another.")
+        sessions = Sessions([Panorama()], ServeConfig(home=True))
+        return lambda host, token: build_app(sessions, host, token)
+
+    def build(self, words):
+        self.built.append(words)
+        return words
+
+
+@contextlib.contextmanager
+def started(token=None):
+    listener, ready, address = open_port("127.0.0.1", 0), threading.Event(), []
+    begun = lambda url: (address.append(url), ready.set())  # noqa: E731
+    server = make_server(StartPage(Drawer(), token=token), listener, "127.0.0.1", token, begun, websockets=True)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+    thread.start()
+    assert ready.wait(20)
+    yield address[0]
+    server.should_exit = True
+    thread.join(20)
+    listener.close()
+
+
+@contextlib.contextmanager
+def client(token=None):
+    """get(path) and post(path, content) -> status, text, headers."""
+    with started(token) as url:
+        base = url.partition("/?")[0].rstrip("/")
+
+        def ask(path: str, content: str | None = None):
+            try:
+                answer = urllib.request.urlopen(base + path, None if content is None else content.encode(), timeout=20)
+            except urllib.error.HTTPError as error:
+                answer = error
+            return SimpleNamespace(status=answer.status, headers=answer.headers, text=answer.read().decode("latin-1"))
+
+        yield SimpleNamespace(get=ask, post=ask)
+
+
+def test_what_is_opened_is_at_the_same_address_and_the_start_page_stays():
+    with client() as http:
+        assert "Step inside" in http.get("/").text and [
+            card["name"] for card in json.loads(http.get("/start/cards").text)
+        ] == [
+            "hills",
+            "broken",
+        ]
+        assert http.get("/start/thumbnail?name=hills").headers["content-type"] == "image/jpeg"
+        assert http.get("/start/thumbnail?name=../secret").status == 404
+        assert http.post("/start/open", json.dumps({"name": "hills"})).status == 200
+        assert 'id="timeline"' in http.get("/").text and http.get("/check").text == "ok"
+        assert "Step inside" in http.get("/start").text
+        assert http.post("/start/build", json.dumps({"words": "a hall"})).status == 200
+
+
+@pytest.mark.parametrize(
+    "body", ["", "[]", "{}", '{"name": 4}', '{"name": ""}', '{"name": "elsewhere"}', '{"name": "broken"}', "[" * 3000]
+)
+def test_what_cannot_be_opened_is_refused_in_one_sentence(body):
+    with client() as http:
+        answer = http.post("/start/open", body)
+        assert answer.status == 422 and answer.text.endswith(".") and "Step inside" in http.get("/").text
+
+
+def test_a_token_is_asked_for():
+    with client("sesame") as http:
+        assert http.get("/start/cards").status == 403 and http.post("/start/open", "{}").status == 403
+        assert http.get("/start/cards?token=sesame").status == 200
+
+
+def test_a_click_opens_a_world_and_its_mark_leads_back(browser):
+    with started("sesame") as url:
+        context = browser.new_context(viewport={"width": 390, "height": 844})
+        page = context.new_page()
+        page.goto(url)
+        page.click("text=Broken")
+        until(page, "document.getElementById('opening').classList.contains('failed')")
+        assert page.text_content("#opening") == "broken cannot be opened; choose another."
+        page.click("#opening")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 390
+        page.click("text=Hills")
+        page.wait_for_selector("#timeline")
+        until(page, "!!window.terrella && terrella.painted > 2")
+        page.click("#brand")
+        page.wait_for_selector(".card")
+        page.fill("#describe", "a hall")
+        page.press("#describe", "Enter")
+        page.wait_for_selector("#timeline")
+        until(page, "!!window.terrella && terrella.painted > 2")
+        context.close()
+
+
+def test_a_folder_has_its_worlds_places_and_recordings(tmp_path):
+    for folder, text in (
+        ("runs/maze/world/world.json", {"kind": "learned", "about": {}, "card": {"what": "of a maze"}}),
+        ("places/hall/world.json", {"kind": "splat", "card": {}}),
+        ("recordings/walk/meta/info.json", {"total_episodes": 3, "total_frames": 1200}),
+        ("recordings/broken/meta/info.json", ["no"]),
+        (".cache/hidden/world.json", {"kind": "splat"}),
+        ("node_modules/x/world.json", {"kind": "splat"}),
+    ):
+        file = tmp_path / folder
+        file.parent.mkdir(parents=True)
+        file.write_text(json.dumps(text))
+    shelf = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent)
+    mine = {(card.title, card.section, card.text) for card in shelf.cards() if card.section not in ("bundled", "game")}
+    assert mine == {
+        ("runs/maze", "world", "of a maze"),
+        ("places/hall", "place", ""),
+        ("recordings/walk", "recording", "3 episodes, 1,200 frames"),
+    }
+    assert {card.name for card in shelf.cards() if card.section == "bundled"} >= {"doom-maze", "doom-corridor"}
+    assert shelf.thumbnail("doom-maze")[:2] == b"\xff\xd8"
+
+
+def test_the_first_view_is_on_the_card_or_chosen_among_learned_worlds_alone():
+    world = Panorama()
+    assert first_seed(world) == 0, "starting a simulator twelve times takes too long"
+    for card, seeds in (({"seed": 7}, {7}), ({"kind": "learned"}, set(range(12)))):
+        world.spec = world.spec.__class__(**{**vars(world.spec), "card": card})
+        assert first_seed(world) in seeds
