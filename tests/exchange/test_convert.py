@@ -224,3 +224,25 @@ def test_what_is_nothing_known_is_said(tmp_path):
     assert list(open_source(tmp_path / "photos", 5.0).sensors)
     with pytest.raises(DatasetError, match="no format 'zip'"):
         write_source(some(1, (3,)), tmp_path / "x", "zip")  # type: ignore[arg-type]
+
+
+def test_names_that_no_file_can_have_are_changed_and_named(tmp_path):
+    names = ("observation.arm/pos", "observation.arm_pos", "/wheel speed", "observation.images.front/rgb", ".hidden")
+    sensors = {name: Sensor(name, "vector", (2,)) for name in names}
+    sensors[names[3]] = Sensor(names[3], "image", (16, 16, 3), "uint8")
+    at = np.arange(4) / 10
+    numbers = {
+        name: np.full((4, *sensor.shape), place, sensor.dtype) for place, (name, sensor) in enumerate(sensors.items())
+    }
+    take = Take({name: Readings(at, values) for name, values in numbers.items()}, "go")
+    notes = write_source(
+        Source("arm", sensors, lambda: [take], 10.0), tmp_path / "out", "lerobot", LeRobotRows(pictures="png")
+    )
+    changed = {
+        "observation.arm/pos": "observation.arm_pos_2", "/wheel speed": "_wheel_speed",
+        "observation.images.front/rgb": "observation.images.front_rgb", ".hidden": "_.hidden",
+    }  # fmt: skip
+    assert notes == [f"'{name}' is '{now}' in LeRobot, whose names are file names." for name, now in changed.items()]
+    (back,) = Dataset(tmp_path / "out").source().takes()
+    for name, values in numbers.items():
+        assert np.array_equal(np.asarray(list(back.readings[changed.get(name, name)].values)), values)

@@ -52,6 +52,12 @@ def current_feature(feature: str) -> str:
     return f"observation.{RENAMED[channel]}" if channel in RENAMED and channel != feature else feature
 
 
+def file_name(feature: str) -> str:
+    """A name that a feature, which names files, can have: "arm/pos" gives "arm_pos"."""
+    plain = re.sub(r"[^\w.-]", "_", feature)[:MOST_LETTERS]
+    return plain if NAME.fullmatch(plain) else f"_{plain}"
+
+
 def features_of(channels: Iterable[str]) -> dict[str, str]:
     """channel -> feature, for all channels of one world. Beside a channel `state`, the pose is observation.pose. Letters that no
     file name may have become "_": "arm/pos" is observation.arm_pos. DatasetError where two channels would share a feature."""
@@ -59,7 +65,7 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
     channels = list(channels)
     for channel in channels:
         feature = POSE if channel == "pose" and "state" in channels else feature_of(channel)
-        feature = re.sub(r"[^\w.-]", "_", feature)[:MOST_LETTERS]
+        feature = file_name(feature)
         for other, taken in features.items():
             if taken.lower() == feature.lower():
                 raise DatasetError(f"the channels '{other}' and '{channel}' would both be {feature}; rename one.")

@@ -1,7 +1,7 @@
 """LeRobot v3.0: reads a dataset as a Source, and writes any Source as one, resampled to rows."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -10,6 +10,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...core.files import creating, not_written
+from ...data.channels import file_name
 from ...data.dataset import Dataset
 from ...data.features import unit_of
 from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, whole_rate
@@ -53,11 +54,13 @@ def write(
     root = Path(os.path.abspath(root))
     if root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise DatasetError(f"{root} is not empty; convert into a new folder.")
+    source, renamed = _with_file_names(source)
     first = next(iter(source.takes()), None)
     if first is None:
         raise DatasetError(f"{source.name} has no takes; choose another recording.")
     lead = _lead(source, first)
     layout, notes = _layout(source, first, lead, how)
+    notes = [*renamed, *notes]
     with creating(root) as staged:
         try:
             notes += _write(source, layout, staged, lead, how, progress)
@@ -68,6 +71,25 @@ def write(
                 raise
             raise not_written(root, error.__cause__) from error  # the recorder's error names `staged`, which is deleted
     return notes
+
+
+def _with_file_names(source: Source) -> tuple[Source, list[str]]:
+    """The source with names that features can have, and a note on each sensor that has another name there."""
+    names: dict[str, str] = {}
+    for name in sorted(source.sensors, key=lambda name: file_name(name) != name):  # good names stay
+        names[name] = rows.unique(file_name(name), names.values())
+    notes = [
+        f"'{name}' is '{now}' in LeRobot, whose names are file names." for name, now in names.items() if name != now
+    ]
+    if not notes:
+        return source, []
+    sensors = {names[name]: replace(sensor, name=names[name]) for name, sensor in source.sensors.items()}
+
+    def takes() -> Iterator[Take]:
+        for take in source.takes():
+            yield replace(take, readings={names.get(name, name): readings for name, readings in take.readings.items()})
+
+    return replace(source, sensors=sensors, takes=takes), notes
 
 
 def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRows, progress) -> list[str]:
