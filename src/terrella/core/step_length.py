@@ -1,8 +1,11 @@
 """Seconds that one step of a Gymnasium environment lasts: from its own clock, control rate, time step or frame rate."""
 
+import ast
+import inspect
 import math
 from collections.abc import Iterator
 from operator import attrgetter
+from textwrap import dedent
 from typing import Any
 
 import gymnasium
@@ -48,8 +51,8 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
 
     `env` has been reset; one with a clock is stepped up to three times. In this order: the advance of its simulated time
     (MuJoCo's `data.time`, or a `time` that all steps advance alike); a control rate; a time step, times its substeps where it
-    counts them. A time step of which two or more whole ones make a frame of `render_fps` is a substep, and the frame is the
-    step. Without any of these, the frame.
+    counts them. A time step of which two or more make a frame of `render_fps` is a substep, and the frame is the step, unless
+    the source of `step` repeats nothing. Without any of these, the frame.
     """
     frame, remark = _frame(env)
     stated = {**_control(env), **_stepped(env, frame), **frame}
@@ -109,7 +112,7 @@ def _stepped(env: gymnasium.Env, frame: dict[str, float]) -> dict[str, float]:
         return lengths
     name, length = next(iter(lengths.items()))
     multiple = frame_s / length
-    if (name in physics and not math.isclose(multiple, 1, rel_tol=0.02)) or _whole(multiple):
+    if (name in physics and not math.isclose(multiple, 1, rel_tol=0.02)) or (_whole(multiple) and _repeats(env)):
         return {**frame, f"{name}, a substep,": length}
     return lengths
 
@@ -120,7 +123,31 @@ def _nearer(one: float, other: float, frame_s: float | None) -> bool:
 
 
 def _whole(multiple: float) -> bool:
-    return multiple > 1.5 and math.isclose(multiple, round(multiple), rel_tol=0.01)
+    return multiple > 1.5 and math.isclose(multiple, round(multiple), rel_tol=0.1)
+
+
+def _repeats(env: gymnasium.Env) -> bool:
+    """Whether a step has a loop that counts, in `step` or in a method of its own that it calls; True where it has no source."""
+    waiting, names = ["step"], set[str]()
+    while waiting:
+        name = waiting.pop()
+        names.add(name)
+        try:
+            bodies = [vars(kind)[name] for kind in type(env.unwrapped).__mro__ if name in vars(kind)]
+            sources = [inspect.getsource(getattr(body, "__func__", body)) for body in bodies]
+            nodes = [node for source in sources for node in ast.walk(ast.parse(dedent(source)))]
+        except (OSError, TypeError, SyntaxError):
+            return True
+        if any(isinstance(node, ast.While) or (isinstance(node, ast.For) and _counts(node.iter)) for node in nodes):
+            return True
+        calls = (node.func for node in nodes if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute))
+        own = {call.attr for call in calls if ast.unparse(call.value) in ("self", "super()")}
+        waiting += [one for one in own - names - {*waiting} if "render" not in one]
+    return False
+
+
+def _counts(loop: ast.expr) -> bool:
+    return isinstance(loop, ast.Call) and ast.unparse(loop.func) == "range"
 
 
 def _frame(env: gymnasium.Env) -> tuple[dict[str, float], list[str]]:
