@@ -55,7 +55,7 @@ export class Drawing {
     upload(gl, this.flags, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, ACROSS, rows, data);
   }
 
-  /** The order to draw in. coarse: each stands for a cube of so many metres for each metre away, and covers it; 0: for itself. */
+  /** The order to draw in. coarse: each covers a cube of that many metres a metre away; 0: itself. */
   order(order, coarse = 0) {
     const { gl } = this, rows = Math.max(1, Math.ceil(order.length / ACROSS)), data = new Uint32Array(rows * ACROSS);
     data.set(order);
