@@ -35,7 +35,8 @@ EDITS = [
     {"select": {"plane": [0, 0, 1, 2.2]}, "do": "delete"},
 ]
 COLUMNS = """() => { const { scene } = terrella.story, listed = (name) => Array.from(scene[name]);
-  return Object.fromEntries(['means', 'scales', 'colours', 'seen', 'objects'].map((name) => [name, listed(name)])); }"""
+  const names = ['means', 'scales', 'colours', 'seen', 'objects', 'opacities'];
+  return Object.fromEntries(names.map((name) => [name, listed(name)])); }"""
 
 PATIENCE_S = 240  # drawn in software, perhaps on a busy machine
 MOVED = """([p, w]) => { const { solid, walker } = terrella, { body } = walker.world;
@@ -123,7 +124,11 @@ def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
 
 
 def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
-    page, place = opened(exported(tmp_path, 3000)), world(3000)
+    place = world(3000)
+    place.objects[300:320], place.gaussians.opacities[300:320] = -3, 0.0  # hidden beneath what becomes object 3
+    save_splat(place, tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page = opened((tmp_path / "place.html").as_uri())
     page.evaluate("edits => { terrella.story.replay(edits); }", EDITS)
     there, here = page.evaluate(COLUMNS), apply_edits(place.gaussians, EDITS, place.objects)
     assert len(there["seen"]) == len(here.gaussians) < 3040
@@ -131,6 +136,7 @@ def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
     seen = torch.where(here.origin < 0, 0, place.provenance[here.origin])
     for name, mine in (("seen", seen), ("objects", here.objects)):
         assert sorted(there[name]) == sorted(mine.tolist())
+    assert min(there["opacities"]) > 0 and not (here.objects < 0).any() and here.gaussians.opacities.min() > 0
     for name, mine, off in (("scales", here.gaussians.scales, 0.035), ("colours", here.gaussians.colours, 0.01)):
         theirs = np.asarray(there[name]).reshape(-1, 3)
         order, other = (

@@ -198,9 +198,11 @@ def test_behind_every_object_lies_a_surface(deed):
     )
     pose = place.starts.clone()
     pose[:, 2] += 1.6
-    assert 0.01 < place.hidden.float().mean() < 0.3
+    assert 0.01 < (place.objects < 0).float().mean() < 0.2
     for number, name in enumerate(place.names, 1):
         after = apply_edits(place.gaussians, [{"select": {"object": number}, **deed}], place.objects).gaussians
         assert rasterise(after, pose, None, (64, 128)).alpha.min() > 0.85, name
     shown = rasterise(place.gaussians, pose, None, (64, 128))
-    assert not place.hidden[shown.ids[shown.ids >= 0].long()].float().mean() > 0.001
+    assert not (place.objects[shown.ids[shown.ids >= 0].long()] < 0).any()
+    recoloured = [{"select": {"object": 1}, "do": "recolour", "colour": [1, 0, 0]}]
+    assert (apply_edits(place.gaussians, recoloured, place.objects).objects < 0).sum() == (place.objects < 0).sum()

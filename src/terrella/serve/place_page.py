@@ -48,7 +48,7 @@ class PlaceScene:
     name: str
     gaussians: Gaussians  # N, before all edits
     seen: torch.Tensor  # bool [N], which of them were observed
-    objects: torch.Tensor  # int32 [N], the object that each belongs to (0: none)
+    objects: torch.Tensor  # int32 [N], the object that each belongs to (0: none; -k: hidden beneath k)
     starts: torch.Tensor  # float32 [S, 7], poses
     collider: Occupancy | Solids  # what stops a walker
     body: Walker
@@ -163,13 +163,13 @@ def _hash(text: str) -> str:
 def _packed(place: PlaceScene, chosen: torch.Tensor) -> bytes:
     """The columns of some Gaussians that scene.js reads: means in float32, because edits select by them, the rest in bytes."""
     scene = place.gaussians.at(chosen)
-    if place.objects.numel() and int(place.objects.max()) > 65535:
+    if place.objects.numel() and int(place.objects.abs().max()) > 65535:
         raise ServeError(f"{place.name} has more than 65,535 objects, and a page shows no more.")
     byte = lambda part: part.round().clamp(0, 255).to(torch.uint8).contiguous().numpy().tobytes()  # noqa: E731
     return b"".join([
         _by_bytes(scene.means.numpy(), "<f4"), _by_bytes(packed_quats(scene.quats).numpy(), "<u4"),
         byte((scene.scales.clamp_min(1e-9).log() + 10) * 16), byte(204 * (0.5 + Y0 * scene.sh[:, 0])), byte(255 * scene.opacities),
-        byte(place.seen[chosen].float()), _by_bytes(place.objects[chosen].clamp(0, 65535).numpy(), "<u2"),
+        byte(place.seen[chosen].float()), _by_bytes(place.objects[chosen].numpy(), "<i4"),
     ])  # fmt: skip
 
 

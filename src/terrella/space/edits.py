@@ -9,7 +9,10 @@ through its origin, then moved; its objects are numbered after the first's:
 
     {"do": "merge", "place": "../other", "sha256": "...", "by": [dx, dy, dz], "degrees": 90}
 
-The page has the same edits (serve/web/place/edits.js). Both compute in double precision and store in single, so that they agree."""
+The page has the same edits (serve/web/place/edits.js). Both compute in double precision and store in single, so that they agree.
+
+Gaussians of the object -k are the surfaces beneath the object k: they are transparent until an edit moves, turns, scales or deletes
+a part of k."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +31,8 @@ ACTIONS = {
     "move": ("by", 3), "duplicate": ("by", 3), "turn": ("degrees", 1), "scale": ("factor", 1), "recolour": ("colour", 3),
     "delete": ("", 0),
 }  # fmt: skip
+REVEALED = 0.99  # opacity of a surface that an edit reveals
+MOVING = ("move", "turn", "scale", "delete")  # these reveal what lies beneath an object
 MOST_DABS = 10_000  # spheres of a brush
 MOST_GAUSSIANS = 20_000_000  # of a place that was edited
 FARTHEST_M = 10_000.0  # from the origin: farther away single precision does not hold a millimetre
@@ -46,8 +51,8 @@ class Contents(Protocol):
 @dataclass(frozen=True)
 class Edited:
     """The Gaussians after edits; origin int64 [N]: the index of each among the first ones and those of all merges, -1 if made or
-    changed by an edit; objects int32 [N]: the object of each, 0 for none (a duplicate is a new object); raised: what each merge
-    added to the numbers of its objects."""
+    changed by an edit; objects int32 [N]: the object of each, 0 for none, -k beneath k (a duplicate is a new object); raised: what
+    each merge added to the numbers of its objects."""
 
     gaussians: Gaussians
     origin: torch.Tensor
@@ -71,10 +76,12 @@ def apply_edits(
             came, chosen = other(edit), torch.zeros(len(gaussians), dtype=torch.bool)
             done, fresh = _placed(came.gaussians, edit), known + torch.arange(len(came.gaussians))
             raised.append(int(objects.max()) if len(objects) else 0)
-            belong = torch.where(came.objects > 0, came.objects + raised[-1], 0).int()
+            belong = (came.objects + raised[-1] * came.objects.sign()).int()
             known += len(done)
         else:
             chosen = select(gaussians, edit, objects)
+            if edit.get("do") in MOVING:
+                gaussians, objects = _revealed(gaussians, objects, objects[chosen])
             done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
             fresh = torch.full((len(done),), -1)
         if edit["do"] == "duplicate":
@@ -88,6 +95,13 @@ def apply_edits(
         origin = torch.cat([origin[~chosen], fresh])
         objects = torch.cat([objects[~chosen], belong[: len(done)]])
     return Edited(gaussians, origin, objects, tuple(raised))
+
+
+def _revealed(gaussians: Gaussians, objects: torch.Tensor, touched: torch.Tensor) -> tuple[Gaussians, torch.Tensor]:
+    """With the surfaces beneath the objects `touched` (numbers) opaque, as parts of no object."""
+    beneath = (objects < 0) & torch.isin(-objects, touched)
+    opacities = torch.where(beneath, REVEALED, gaussians.opacities)
+    return replace(gaussians, opacities=opacities), torch.where(beneath, 0, objects)
 
 
 def merges_of(edits: Sequence[Edit]) -> list[Edit]:

@@ -161,7 +161,7 @@ def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildS
     starts = place.starts.clone()
     starts[:, 2] += WALKER.eye_m
     card = {"objects": list(place.names), **({"text": parsed.text} if parsed.text else {})}
-    origin = torch.where(place.hidden, INVENTED, OBSERVED).to(torch.uint8)
+    origin = torch.where(place.objects < 0, INVENTED, OBSERVED).to(torch.uint8)
     world = SplatWorld(
         parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,
         SolidBoxes(place.solids, place.bodies),

@@ -21,7 +21,7 @@ from ..space.files import AXES, replace_whole, write_scene
 from ..space.files.glb import encode_gaussians, encode_mesh
 from ..space.files.spz import Version
 from ..space.mesh import collider_mesh, fused, viewpoints
-from ..space.raster import rasterise
+from ..space.raster import Gaussians, rasterise
 from ..space.raster.move import transform
 from ..worlds.splat import SplatWorld
 from ..worlds.splat_folder import read_edits
@@ -68,12 +68,17 @@ def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResu
     elif suffix in (".glb", ".png", ".mp4"):
         content, facts = _drawn(open_splat(world), suffix, config)
     else:
-        opened = open_splat(world)
-        write_scene(opened.gaussians, file, config.axes, "compressed" if config.compressed else "", config.spz)
-        content, facts = None, {"gaussians": len(opened.gaussians)}
+        shown = _opaque(open_splat(world).gaussians)
+        write_scene(shown, file, config.axes, "compressed" if config.compressed else "", config.spz)
+        content, facts = None, {"gaussians": len(shown)}
     if content is not None:
         replace_whole(file, lambda staged: staged.write_bytes(content))
     return SpaceResult({**facts, "bytes": file.stat().st_size, "file": str(file)})
+
+
+def _opaque(gaussians: Gaussians) -> Gaussians:
+    """Those that are drawn: without the surfaces that objects hide."""
+    return gaussians.at(gaussians.opacities > 0)
 
 
 def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[bytes, Mapping[str, Any]]:
@@ -93,7 +98,8 @@ def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[b
 def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
     rot = torch.tensor(AXES["rub"], dtype=torch.float32)
     if config.kind == "gaussians":
-        return encode_gaussians(transform(world.gaussians, rot), world.name), {"gaussians": len(world.gaussians)}
+        shown = _opaque(world.gaussians)
+        return encode_gaussians(transform(shown, rot), world.name), {"gaussians": len(shown)}
     if not 0.005 <= config.cell <= 10:
         raise TerrellaError("--cell is from 0.005 to 10 metres.")
     if config.kind == "collider":

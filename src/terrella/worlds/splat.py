@@ -72,10 +72,10 @@ class SolidBoxes(NamedTuple):
 @final
 class SplatWorld:
     """Gaussians with a provenance each, uint8 [N] (OBSERVED: seen, or built as asked; INVENTED: added, or changed by an edit), and
-    `starts` [S, 7], poses in which episodes begin.
-    `objects` int32 [N]: the object of each Gaussian (0: none); `card["objects"]` may list the names of 1, 2, ... Bodies collide
-    with `solids`, or without any with what the Gaussians fill. Where MuJoCo is installed, objects that can be pushed are rigid
-    bodies that carry their Gaussians; the channel `bodies` [K, 7] has their poses, in the order of the objects.
+    `starts` [S, 7], poses in which episodes begin. `objects` int32 [N]: the object of each Gaussian (0: none; -k: hidden beneath
+    k until an edit moves k); `card["objects"]` may list the names of 1, 2, ... Bodies collide with `solids`, or without any with
+    what the Gaussians fill. Where MuJoCo is installed, objects that can be pushed are rigid bodies that carry their Gaussians;
+    the channel `bodies` [K, 7] has their poses, in the order of the objects.
 
     rgb and depth (0: nothing) are drawn by `rasterise`; ids int32 [H, W]: the Gaussian with the largest share of a pixel (-1:
     none); known [H, W]: how much of a pixel was observed; uncertainty: the share of the picture that was not. UP lifts off;
@@ -175,7 +175,7 @@ class SplatWorld:
         """Which Gaussians ride on things, and on which."""
         place = torch.full((max(int(self.objects.max()) if len(self.objects) else 0, *self.things, 0) + 1,), -1)
         place[self.things] = torch.arange(len(self.things))
-        on = place[self.objects.long()]
+        on = place[self.objects.long().clamp_min(0)]
         rows = (on >= 0).nonzero()[:, 0]
         return rows, on[rows]
 

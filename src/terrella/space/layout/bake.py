@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..camera import planar_pose
+from ..edits import REVEALED
 from ..kernels_numba import light as kernels
 from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
@@ -23,7 +24,8 @@ LAMPS = 40  # point lights that approximate all light sources, per room
 BOUNCES = 3
 SLIM_M = 0.05  # narrower sides emit no light
 SUN = 14.0  # brightness, relative to a white wall outdoors
-OPACITY, OVERLAP = 0.99, 0.7  # standard deviation of a Gaussian as a share of the grid's spacing
+OPACITY = REVEALED
+OVERLAP = 0.7  # standard deviation of a Gaussian as a share of the grid's spacing
 FINEST_M, THIN_M = 0.006, 0.0015
 _AXES = ((1, 2), (0, 2), (0, 1))  # the two axes along a side, for each axis across it
 
@@ -33,12 +35,13 @@ class BuiltPlace:
     """A place built from a layout."""
 
     gaussians: Gaussians
-    objects: torch.Tensor  # int32 [N], the object of each Gaussian (0: the building)
+    objects: (
+        torch.Tensor
+    )  # int32 [N], the object of each Gaussian (0: the building; -k: the building beneath the object k)
     names: tuple[str, ...]  # of objects 1, 2, ...
     solids: torch.Tensor  # float32 [S, 6], boxes that stop walkers
     bodies: torch.Tensor  # int32 [S], the movable object of each box (0: none)
     starts: torch.Tensor  # float32 [R, 7], a pose in each room, at the height of its floor
-    hidden: torch.Tensor  # bool [N], the Gaussians that objects hide until they are moved or deleted
 
 
 @dataclass
@@ -71,17 +74,15 @@ def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
     fine = np.array([FINE.get(look.material, 1.0) for look in blocks.looks])
     apart = math.sqrt((area * fine[texels.blocks]).sum() / count)
     spacing = np.clip(apart / np.sqrt(fine), FINEST_M, 0.3)
-    objects = np.asarray(blocks.objects, np.int32)
-    cells, hidden = _surfaces(_grid(boxes, spacing), boxes, air, objects)
+    cells, objects = _surfaces(_grid(boxes, spacing), boxes, air, np.asarray(blocks.objects, np.int32), bodies)
     colours = _brightness(plan, blocks, boxes, cells, texels, bare, light)
     return BuiltPlace(
-        _gaussians(cells, colours),
-        torch.from_numpy(objects[cells.blocks]),
+        _gaussians(cells, colours, objects >= 0),
+        torch.from_numpy(objects),
         tuple(blocks.names),
         torch.from_numpy(blocks.solids),
         torch.from_numpy(bodies[np.asarray(blocks.solid)]),
         _starts(plan, blocks),
-        torch.from_numpy(hidden),
     )
 
 
@@ -123,15 +124,21 @@ def _in(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _surfaces(grid: _Grid, boxes: np.ndarray, air: np.ndarray, objects: np.ndarray) -> tuple[_Grid, np.ndarray]:
-    """The cells that are visible, now or after objects [K] were moved or deleted, and which of them are hidden now."""
-    whose = objects[grid.blocks]
-    bare, kept = _bare(grid, boxes, air), _bare(grid, boxes[objects == 0], air)
+def _surfaces(
+    grid: _Grid, boxes: np.ndarray, air: np.ndarray, objects: np.ndarray, bodies: np.ndarray
+) -> tuple[_Grid, np.ndarray]:
+    """The cells that are visible, now or after objects were pushed, moved or deleted; and of each the object [N], as in a world:
+    -k for what is hidden beneath the fixed object k."""
+    front, whose = grid.points + 0.004 * grid.normals, objects[grid.blocks]
+    kept = _in(front, air) & ~_in(front, boxes[objects == 0])
     for number in range(1, objects.max(initial=0) + 1):
-        rows = np.flatnonzero(whose == number)
-        kept[rows] = ~_in(grid.points[rows] + 0.004 * grid.normals[rows], boxes[objects == number])
+        rows, own = np.flatnonzero(whose == number), boxes[objects == number]
+        kept[rows] = ~_in(front[rows], own) & ((bodies[objects == number].max() > 0) | kept[rows])
+        rows = np.flatnonzero(kept & (whose == 0))
+        if bodies[objects == number].max() == 0:
+            whose[rows[_in(front[rows], own)]] = -number
     cells = _Grid(grid.points[kept], grid.sides[kept], grid.blocks[kept], grid.widths[kept], grid.starts, grid.counts)
-    return cells, ~bare[kept]
+    return cells, whose[kept]
 
 
 def _light(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, texels: _Grid, bare: np.ndarray) -> np.ndarray:
@@ -316,14 +323,15 @@ def _interpolated(
     return total / np.maximum(weight, 1e-9)[:, None], weight
 
 
-def _gaussians(cells: _Grid, colours: np.ndarray) -> Gaussians:
+def _gaussians(cells: _Grid, colours: np.ndarray, shown: np.ndarray) -> Gaussians:
+    """Flat Gaussians of the cells; those that are not `shown` [N] are transparent."""
     count = len(cells.points)
     scales = np.full((count, 3), THIN_M)
     scales[np.arange(count)[:, None], np.array(_AXES)[cells.sides // 2]] = OVERLAP * cells.widths
     means = cells.points - THIN_M * cells.normals
     to = lambda part: torch.from_numpy(np.ascontiguousarray(part, np.float32))  # noqa: E731
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
-    return Gaussians(to(means), quats, to(scales), torch.full((count,), OPACITY), plain_sh(to(colours)))
+    return Gaussians(to(means), quats, to(scales), to(OPACITY * shown), plain_sh(to(colours)))
 
 
 def _starts(plan: RoomLayout, blocks: Blocks) -> torch.Tensor:

@@ -85,7 +85,7 @@ function run({ drawing, source, story, solid: first }) {
     map.layer = null;
     seen.sorted = '';
     $('what').textContent = `${seen.stands > 1 ? `${scene.length.toLocaleString('en')} of ${world.count.toLocaleString('en')}` : scene.length.toLocaleString('en')} Gaussians${made}`;
-    const known = scene.seen.reduce((sum, one) => sum + one, 0) / scene.length;
+    const drawn = scene.opacities.reduce((sum, one) => sum + (one > 0), 0), known = scene.seen.reduce((sum, one, k) => sum + (one && scene.opacities[k] > 0), 0) / Math.max(drawn, 1);
     $('share-seen').textContent = `${Math.round(100 * known)}%`;
     $('share-invented').textContent = `${Math.round(100 * (1 - known))}%`;
     redraw();

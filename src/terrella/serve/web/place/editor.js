@@ -122,7 +122,7 @@ export class Editor {
 
   show() {
     const { story, chosen, mask } = this, kind = chosen && Object.keys(chosen)[0];
-    const any = story.scene.objects.some(Boolean), object = document.querySelector('[data-tool=object]');
+    const any = story.scene.objects.some((number) => number > 0), object = document.querySelector('[data-tool=object]');
     object.disabled = !any;
     object.title = any ? '' : 'This place has no separate objects';
     $('count').textContent = !chosen ? 'Nothing selected' : `${(mask?.count ?? 0).toLocaleString('en')} selected${kind === 'object' ? `: ${story.scene.names[chosen.object - 1] || `object ${chosen.object}`}` : ''}`;
@@ -138,7 +138,7 @@ export class Editor {
     $('undo').disabled = !story.edits.length;
     $('redo').disabled = !story.undone.length;
     $('save').disabled = !story.unsaved;
-    $('edits').replaceChildren(...story.edits.map((edit, at) => Object.assign(document.createElement('li'), { textContent: describe(edit), title: JSON.stringify(edit) })));
+    $('edits').replaceChildren(...story.edits.map((edit, at) => Object.assign(document.createElement('li'), { textContent: describe(edit, story.scene.names), title: JSON.stringify(edit) })));
     [...$('edits').children].forEach((item, at) => { item.dataset.number = at + 1; });
     $('edits').scrollTop = 1e6;
   }

@@ -2,7 +2,7 @@
 
 import { joined } from './scene.js';
 
-const MOST_OBJECTS = 65535;
+const MOST_OBJECTS = 65535, REVEALED = 0.99, MOVING = ['move', 'turn', 'scale', 'delete'];
 const single = (numbers) => [numbers].flat().map(Math.fround);
 
 /** Which Gaussians {kind: numbers} selects: 1 or 0 for each, and their `count`. */
@@ -41,6 +41,7 @@ export function edited(scene, edit, others) {
   if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
   if (!mask.count) throw new Error('nothing is selected there; choose another place.');
+  if (MOVING.includes(edit.do)) scene = revealed(scene, mask);
   if (edit.do === 'delete') return scene.at(numbers(mask, 0));
   if (edit.do === 'duplicate') {
     const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
@@ -58,6 +59,15 @@ export function edited(scene, edit, others) {
   return after;
 }
 
+/** The scene with the surfaces beneath the selected objects opaque, as parts of no object. */
+function revealed(scene, mask) {
+  const touched = new Set(scene.objects.filter((number, k) => mask[k] && number > 0));
+  if (!scene.objects.some((number) => touched.has(-number))) return scene;
+  const after = scene.copy();
+  for (let k = 0; k < after.length; k += 1) if (touched.has(-after.objects[k])) { after.opacities[k] = REVEALED; after.objects[k] = 0; }
+  return after;
+}
+
 /** The scene and all of another one: turned about the vertical through its origin, then moved; its objects are numbered on. */
 function merged(scene, other, by, degrees) {
   if (!other) throw new Error('this page does not hold the place that is merged; `terrella space edit PLACE --merge OTHER` merges it.');
@@ -65,7 +75,7 @@ function merged(scene, other, by, degrees) {
   if (raised + highest(other.objects) > MOST_OBJECTS) throw new Error('a page shows no more than 65,535 objects.');
   for (let k = 0; k < part.length; k += 1) {
     turn(k);
-    if (part.objects[k]) part.objects[k] += raised;
+    part.objects[k] += raised * Math.sign(part.objects[k]);
   }
   const names = [...Array.from({ length: raised }, (_, k) => scene.names[k]), ...other.names], known = scene.boxes && other.boxes && degrees % 90 === 0;
   return Object.assign(joined(scene, part), { names, boxes: known ? [...scene.boxes, ...placed(other.boxes, by, degrees / 90)] : null });
@@ -116,10 +126,10 @@ const scaled = ({ means, scales }, factor, middle) => (k) => {
 
 const recoloured = ({ colours }, colour) => (k) => colours.set(colour, 3 * k);
 
-/** An edit in words. */
-export function describe(edit) {
+/** An edit in words; `names` are those of the objects. */
+export function describe(edit, names = []) {
   if (edit.do === 'merge') return `merge ${edit.place.split('/').at(-1)} at ${edit.by.join(' ')} m${edit.degrees ? `, turned by ${edit.degrees}°` : ''}`;
-  const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? `object ${edit.select.object}` : `a ${kind}`;
+  const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? (names[edit.select.object - 1] || `object ${edit.select.object}`) : `a ${kind}`;
   const more = { move: () => `by ${edit.by.join(' ')} m`, duplicate: () => `${edit.by.join(' ')} m away`, turn: () => `by ${edit.degrees}°`, scale: () => `× ${edit.factor}`, recolour: () => '', delete: () => '' }[edit.do]();
   return `${edit.do} ${what} ${more}`.trim();
 }

@@ -3,8 +3,8 @@
 const UNPACKED = { means: 3, quats: 4, scales: 3, colours: 3, opacities: 1 };
 
 /**
- * N Gaussians: means, quats (w x y z), scales, colours and opacities as float32, metres; seen 1 or 0, objects: numbers, 0 for none,
- * whose names 1, 2, ... `names` lists; boxes, as boxes.js has them, where they are what stops bodies, else null.
+ * N Gaussians: means, quats (w x y z), scales, colours and opacities as float32, metres; seen 1 or 0, objects: numbers, 0 for none and -k
+ * for what is hidden beneath k, whose names 1, 2, ... `names` lists; boxes, as boxes.js has them, where they are what stops bodies, else null.
  */
 export class Scene {
   constructor(columns, names = [], boxes = null) {
@@ -64,7 +64,7 @@ export function unpackScene(reader, { count, objects, boxes }) {
   const scales = Float32Array.from(reader.take(3 * count), (byte) => Math.exp(byte / 16 - 10));
   const colours = Float32Array.from(reader.take(3 * count), (byte) => byte / 204);
   const opacities = Float32Array.from(reader.take(count), (byte) => byte / 255);
-  return new Scene({ means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Uint16Array) }, objects, boxes?.length ? boxes : null);
+  return new Scene({ means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Int32Array) }, objects, boxes?.length ? boxes : null);
 }
 
 /** Which of w, x, y, z is largest in 2 bits, the three others in 10 each. */

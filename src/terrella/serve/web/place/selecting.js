@@ -27,7 +27,7 @@ export class Selecting {
     const from = hit.place, brushes = this.tool === 'brush';
     if (this.on.mask()?.[hit.number] && !brushes) this.doing = { does: 'move', from, shift: [0, 0, 0] };
     else if (this.tool === 'object') {
-      const number = this.on.scene().objects[hit.number];
+      const number = Math.max(0, this.on.scene().objects[hit.number]);
       if (number) this.on.choose({ object: number });
       else this.on.say('This belongs to no object; select it with a box, a sphere or the brush.');
       this.doing = { does: 'nothing' };

@@ -70,7 +70,7 @@ function sorting() {
     for (let k = 0; k < depth.length; k += 1) {
       const x = means[3 * k] - ex, y = means[3 * k + 1] - ey, z = means[3 * k + 2] - ez, d = x * ax + y * ay + z * az;
       depth[k] = -1;
-      if (d < near || Math.abs(x * rx + y * ry + z * rz) - wide * ASIDE * d > reach[k] * across || Math.abs(x * ux + y * uy + z * uz) - tall * ASIDE * d > reach[k] * upright) continue;
+      if (!opacities[k] || d < near || Math.abs(x * rx + y * ry + z * rz) - wide * ASIDE * d > reach[k] * across || Math.abs(x * ux + y * uy + z * uz) - tall * ASIDE * d > reach[k] * upright) continue;
       depth[k] = d;
       all += 1;
       if (most < Infinity) rings[(ring[k] = ringOf(Math.sqrt(x * x + y * y + z * z))) * (LEVELS + 1) + levels[k]] += 1;
