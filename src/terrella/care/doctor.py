@@ -9,7 +9,7 @@ from pathlib import Path
 from ..core.errors import DatasetError
 from ..core.losses import by_reason
 from ..data.channels import DONE
-from ..data.format import INFO, STATS
+from ..data.format import INFO, STATS, some_of
 from ..data.storage import journal, mp4
 from .film_checks import FilmFacts, equal_digests, examine_films
 from .motion_checks import check_alignment
@@ -74,7 +74,7 @@ def examine(root: str | Path) -> Examination:
     faults += [] if busy else check_statistics(folder, rows)  # they may count the episode that is being committed
     faults += _duplicates(folder, rows, shown)
     still, notes = constant_columns(folder, rows)
-    notes += _padding(folder)
+    notes += [*_padding(folder), *_unexamined(folder, rows)]
     left_out = folder.world.get("left_out")
     notes += [f"left out when it was recorded: {line}" for line in by_reason(left_out)]
     faults += [*still, *frozen_states(folder, rows, shown.static), *check_alignment(folder, rows, shown)]
@@ -177,11 +177,20 @@ def _padding(folder: Survey) -> Iterator[str]:
             absent.setdefault(name, []).append(number)
     for name, numbers in absent.items():
         if name in folder.features and name != DONE:
-            some = ", ".join(map(str, numbers[:_EXAMPLES])) + ", …" * (len(numbers) > _EXAMPLES)
-            yield (
-                f"{name} has no readings in {len(numbers)} of {len(folder.episodes)} episodes ({some}): their rows of it are "
-                "padding, which training leaves out"
-            )
+            where = f"{len(numbers)} of {len(folder.episodes)} episodes ({some_of(numbers)})"
+            yield f"{name} has no readings in {where}: their rows of it are padding, which training leaves out"
+
+
+def _unexamined(folder: Survey, rows: RowFacts) -> Iterator[str]:
+    """Notes on files and columns that are no part of the dataset."""
+    known = {*folder.data, *folder.films}
+    files = [path.relative_to(folder.root).as_posix() for path in sorted(folder.root.rglob("*")) if path.is_file()]
+    plain = ("meta/", "streams/", ".", "README", "LICENSE")
+    strange = [file for file in files if file not in known and not file.startswith(plain)]
+    if strange:
+        yield f"files that are no part of the dataset were not examined: {some_of(strange)}"
+    for name in sorted(rows.unlisted):
+        yield f"the column '{name}' is in the tables but not in info.json: no reader sees it until that file names it"
 
 
 # -- duplicates ------------------------------------------------------------------------------------------------------

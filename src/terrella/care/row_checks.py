@@ -52,6 +52,7 @@ class RowFacts:
     summary: dict[str, stats.Summary] = field(default_factory=dict)
     acted: dict[str, stats.Summary] = field(default_factory=dict)
     broken: set[str] = field(default_factory=set)  # files with rows that cannot be read
+    unlisted: set[str] = field(default_factory=set)  # columns that info.json does not name
 
 
 def examine_rows(survey: Survey, facts: RowFacts, busy: bool) -> Iterator[Fault]:
@@ -94,6 +95,7 @@ def _file(
             actual = f"is {form.field(name).type}" if name in form.names else "is missing"
             what = f"column '{name}' {actual}, but info.json states {promised.field(name).type}"
             yield Fault(file, first, what, RESTORE)
+        facts.unlisted |= set(form.names) - set(promised.names)
         columns = [name for name in promised.names if name not in wrong]
         if "episode_index" not in columns:
             facts.broken.add(file)

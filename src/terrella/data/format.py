@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -128,6 +128,12 @@ def names_of(feature: Mapping) -> tuple[str, ...]:
     if isinstance(names, dict):  # older writers group them
         names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
     return tuple(str(name) for name in names) if names else ()
+
+
+def some_of(things: Sequence[object], most: int = 5) -> str:
+    """The first few things in words: "3, 5, 8, 9, 12 and 4 more"."""
+    more = f" and {len(things) - most} more" * (len(things) > most)
+    return ", ".join(map(str, things[:most])) + more
 
 
 def sensor_json(sensor: Sensor) -> dict:

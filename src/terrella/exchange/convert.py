@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from ..core.errors import DatasetError
-from ..data.format import INFO
+from ..data.format import INFO, some_of
 from ..data.source import Sensor, Source, Take
 from .formats.folders import IMAGES, VIDEOS
 from .formats.rows import facts_of
 
 Format = Literal["lerobot", "mcap", "minari", "robomimic", "rollouts", "videos", "images"]
 _MAX_DEPTH = 4  # levels of subfolders that are searched for recordings
+_PICTURES_ONLY = ("videos", "images")
 _SENSOR_FACTS = ("names", "units", "frame", "facts")
 
 
@@ -28,6 +29,7 @@ class _Kind:
     # "text" (string features), "task", "language", "start_ns", "sensors" (names, units, facts), "facts" (of takes), or
     # single facts of takes by name
     keeps: Collection[str] = ()
+    depth: int = 1  # levels of folders in which its files lie; 0 where its own folders are known
 
 
 def _call(function: str, *args: Any, **kwargs: Any) -> Any:
@@ -36,16 +38,20 @@ def _call(function: str, *args: Any, **kwargs: Any) -> Any:
 
 
 _ALL = {"text", "task", "language", "start_ns", "facts", "sensors"}
+_NO_DATA = ("terrella.json", "readme", "license", "licence")  # names of files, as they begin, that hold no recording
+_LEROBOT = ("meta", "data", "videos", "streams", "images")
 _KINDS: dict[str, _Kind] = {
-    "lerobot": _Kind("LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL),  # its writer notes what it leaves out
+    "lerobot": _Kind(
+        "LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL, depth=0
+    ),  # its writer notes what it leaves out
     "mcap": _Kind("MCAP", "mcap.read", "mcap_write.write", (".mcap",), _ALL - {"text"}),
-    "minari": _Kind("Minari", "minari.read", "minari.write", (), ("task", "start_ns", "sensors", "minari", "texts")),
+    "minari": _Kind("Minari", "minari.read", "minari.write", (), ("task", "start_ns", "sensors", "minari", "texts"), 0),
     "robomimic": _Kind(
-        "HDF5", "hdf5.read", "robomimic.write", (".hdf5", ".h5", ".hdf"), ("task", "sensors", "robomimic")
+        "HDF5", "hdf5.read", "robomimic.write", (".hdf5", ".h5", ".hdf"), ("task", "sensors", "robomimic"), 99
     ),
     "rollouts": _Kind("npz rollouts", "rollouts.read", "rollouts.write", (".npz",), ("task", "start_ns", "sensors")),
-    "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS),
-    "images": _Kind("images", "images.read", "images.write", IMAGES),
+    "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS, depth=2),
+    "images": _Kind("images", "images.read", "images.write", IMAGES, depth=3),
 }
 _READ = ", ".join(kind.name for kind in _KINDS.values())
 
@@ -62,8 +68,26 @@ def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, 
     name = str(path)
     if name.startswith("gym:"):
         return _call("environments.from_env", name.removeprefix("gym:"), episodes=episodes, seed=seed, fps=fps)
-    kind = _KINDS["lerobot" if "://" in name else _kind(Path(path))]
-    return _call(kind.read, name if "://" in name else Path(path), fps=fps)
+    if "://" in name:
+        return _call(_KINDS["lerobot"].read, name, fps=fps)
+    kind = _KINDS[_kind(Path(path))]
+    source = _call(kind.read, Path(path), fps=fps)
+    return replace(source, notes=(*source.notes, *_unread_files(Path(path), kind)))
+
+
+def _unread_files(path: Path, kind: _Kind) -> list[str]:
+    """A note on the files of a folder that are not read: of other formats, or deeper than the format's own."""
+    if path.is_file():
+        return []
+    unread = []
+    for file in sorted(path.rglob("*")):
+        parts = file.relative_to(path).parts
+        own = file.suffix.lower() in kind.suffixes and len(parts) <= kind.depth
+        own |= not kind.depth and (parts[0] in _LEROBOT or not kind.suffixes and kind.name == "Minari")
+        plain = any(part.startswith(".") for part in parts) or parts[-1].lower().startswith(_NO_DATA)
+        if file.is_file() and not own and not plain:
+            unread.append("/".join(parts))
+    return [f"files of {path.name} that are no {kind.name} were left out: {some_of(unread)}."] if unread else []
 
 
 def _kind(path: Path) -> str:
@@ -132,6 +156,8 @@ def write_source(
             if facts and sensor.kind in ("image", "depth"):
                 lost[f"{', '.join(calibration or facts)} of '{name}'"] = None
     notes |= dict.fromkeys(written)
+    if "facts" not in kind.keeps and chosen in _PICTURES_ONLY and kept.facts:
+        lost[f"what is known of the recording ({', '.join(kept.facts)})"] = None
     absent = _absences(kept, seen, "; its rows there are marked as padding" if chosen == "lerobot" else "")
     return [*notes, *absent, *(f"{what} has no place in {kind.name} and was left out." for what in lost)]
 
@@ -148,17 +174,14 @@ def _without_text(source: Source, notes: dict[str, None], kind: _Kind) -> Source
     return replace(source, sensors=sensors, takes=takes) if texts else source
 
 
-_EXAMPLES = 5  # takes that a note names
-
-
 def _absences(source: Source, seen: dict[str, list[int]], then: str) -> Iterator[str]:
     """A note on each sensor that some takes lack; seen: sensor -> the takes that have it, "" -> all."""
     every = seen.get("", [])
     for name in source.sensors:
         lacking = sorted(set(every).difference(seen.get(name, ())))
         if lacking:
-            some = ", ".join(map(str, lacking[:_EXAMPLES])) + ", …" * (len(lacking) > _EXAMPLES)
-            where = "any take" if len(lacking) == len(every) else f"{len(lacking)} of {len(every)} takes ({some})"
+            some = f"{len(lacking)} of {len(every)} takes ({some_of(lacking)})"
+            where = "any take" if len(lacking) == len(every) else some
             yield f"'{name}' has no readings in {where}{then}."
 
 

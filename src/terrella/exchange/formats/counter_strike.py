@@ -23,6 +23,7 @@ AUX = tuple(
     for back in (1, 2, 3)
     for name in (*KEYS, *CLICKS, "mouse_x_of_1000", "mouse_y_of_200", "health_of_100", "ammo_of_30", "is_ct")
 )
+_FRAME = r"frame_\d+_(x|xaux|y|helperarr)"
 _PARTS = {  # frame_i_PART -> its sensor, and the names of its numbers
     "x": (f"{rows.IMAGES}{rows.CAMERA}", ()),
     "xaux": ("observation.xaux", AUX),
@@ -48,9 +49,10 @@ def read(path: Path, files: list[Path], fps: float | None) -> Source:
 
     def takes(rate: float) -> Iterator[Take]:
         for file in files:
-            stored = _episode(file, sensors)
+            stored, others = _episode(file, sensors)
             readings = arrays.readings(stored, sensors, np.arange(stored["x",].shape[0]) / rate, str(file))
-            yield Take(readings, facts={"file": file.relative_to(base).as_posix()})
+            notes = (f"'{name}' is left out: it is not known." for name in others)
+            yield Take(readings, facts={"file": file.relative_to(base).as_posix()}, notes=tuple(notes))
 
     name = path.name if path.is_dir() else path.stem
     facts = {"layout": "counter-strike"}
@@ -69,7 +71,8 @@ def _sensor(path: Path, file: hdf5_file.File, part: str, fps: float) -> Sensor:
     return Sensor(name, kind, data.shape, data.dtype.name, names if len(names) == len(data) else (), rate_hz=fps)
 
 
-def _episode(path: Path, sensors: Mapping[arrays.Place, Sensor]) -> dict[arrays.Place, arrays.Array]:
+def _episode(path: Path, sensors: Mapping[arrays.Place, Sensor]) -> tuple[dict[arrays.Place, arrays.Array], list[str]]:
+    """The arrays of a file, and the kinds of others in it, with # for the number of the frame."""
     with hdf5_file.open_file(path) as file:
         names = set(hdf5_file.names_in(file))
     frames = sum(bool(re.fullmatch(r"frame_\d+_x", key)) for key in names)
@@ -92,4 +95,5 @@ def _episode(path: Path, sensors: Mapping[arrays.Place, Sensor]) -> dict[arrays.
 
         return arrays.Array((frames, *sensor.shape), np.dtype(sensor.dtype), read)
 
-    return {place: one(str(place[0]), sensor) for place, sensor in sensors.items()}
+    others = {re.sub(r"\d+", "#", key) for key in names if not re.fullmatch(_FRAME, key)}
+    return {place: one(str(place[0]), sensor) for place, sensor in sensors.items()}, sorted(others)

@@ -24,7 +24,8 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
     Either the images in the folder are one take of the camera "observation.images.rgb"; or each subfolder is one take, with
     images in it or with a folder of images per camera ("take_0/front/1.png": "observation.images.front"). Takes and images
-    are in natural order (2 before 10). EXIF orientation is applied; transparency and further frames are dropped.
+    are in natural order (2 before 10). EXIF orientation is applied; transparency and further frames are dropped, which the
+    notes of takes say.
 
     16-bit images are depth in millimetres, 0 for no measurement (inf): "observation.depth", or "observation.depth.NAME" for
     the folder NAME or NAME_depth. DatasetError where there are no images, or one is damaged, too large, or of another size
@@ -51,6 +52,9 @@ def read(path: str | Path, fps: float | None = None) -> Source:
             Take(
                 {names[c]: _images(files, sensors[names[c]], fps) for c, files in folder.items()},
                 facts={"folder": name},
+                notes=tuple(
+                    dict.fromkeys(note for files in folder.values() for file in files for note in _losses(file))
+                ),
             )
             for name, folder in takes.items()
         ),
@@ -88,6 +92,14 @@ def _look(path: Path) -> tuple[Literal["image", "depth"], tuple[int, ...]]:
         if picture.mode == "F":
             raise DatasetError(f"{path} has numbers with fractions, of unknown unit; make it an 8-bit or 16-bit image.")
         return ("depth", (height, width)) if picture.mode.startswith("I") else ("image", (height, width, 3))
+
+
+def _losses(path: Path) -> list[str]:
+    """Notes on what of an image is not read."""
+    with _image(path) as picture:
+        clear = "A" in picture.getbands() or "transparency" in picture.info
+        notes = ["the transparency of images was dropped."] if clear else []
+        return notes + ["of images with several frames the first was kept."] * (getattr(picture, "n_frames", 1) > 1)
 
 
 def _load(path: Path, sensor: Sensor) -> np.ndarray:

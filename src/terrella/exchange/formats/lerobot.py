@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,12 +18,26 @@ from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, whole_rate
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
 from ...data.source import Readings, Sensor, Source, Take, is_outcome
+from ...data.storage.remote import LocalFiles
+from ...data.storage.tables import open_parquet
 from . import rows
 
 
 def read(root: str | Path, fps: float | None = None) -> Source:
     """A LeRobot v3.0 folder, or its address. `fps` is ignored: the dataset states its own."""
-    return Dataset(root).source()
+    data = Dataset(root)
+    unlisted: list[str] = []
+    if isinstance(data.files, LocalFiles) and len(data.episodes):
+        with (
+            suppress(DatasetError, ValueError, OSError),
+            open_parquet(data.files.local(data.episodes[0].data)) as table,
+        ):
+            unlisted += [f"the column '{name}'" for name in table.schema_arrow.names if name not in data.features]
+        films = data.files.list("videos", ".mp4")
+        cameras = dict.fromkeys(film.split("/")[1] for film in films if film.count("/") > 1)
+        unlisted += [f"the camera '{name}'" for name in cameras if name not in data.features]
+    notes = (f"{what} is not in info.json and was left out." for what in unlisted)
+    return replace(data.source(), notes=tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -146,6 +161,9 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
     sensors, streams, pictures = {}, {}, how.pictures
     for name, sensor in source.sensors.items():
         if name in (*AUTOMATIC, ACTION_VALID, TIME):
+            continue
+        if sensor.kind != "points" and 0 in sensor.shape:
+            notes.append(f"{name} was left out: it has no numbers")
             continue
         reserved = sensor.kind == "points" or (
             sensor.rate_hz is not None and whole_rate(sensor.rate_hz) != whole_rate(rate)

@@ -19,7 +19,6 @@ from .spaces import split_texts
 
 ABOUT = "terrella.json"  # our description, in the folder of the episodes: names, units and frames
 TIME, TASK, START = "time_s", "task", "start_ns"
-_OWN = ((TIME,), (TASK,), (START,))
 
 
 def read(path: str | Path, fps: float | None = None) -> Source:
@@ -62,7 +61,12 @@ def read(path: str | Path, fps: float | None = None) -> Source:
 
 def _columns(path: Path) -> dict[Place, Array]:
     """The arrays of a file but for the times, task and start that `write` stores."""
-    return {place: array for place, array in _arrays(path).items() if place not in _OWN}
+    return {place: array for place, array in _arrays(path).items() if not _is_own(place, array)}
+
+
+def _is_own(place: Place, array: Array) -> bool:
+    """Whether it is one of the arrays that `write` stores beside the readings: the times, the task, the start."""
+    return place == (TIME,) or (place in ((TASK,), (START,)) and array.shape == ())
 
 
 def _place(key: str) -> Place:
@@ -121,7 +125,7 @@ def _load(path: Path, key: str) -> np.ndarray:
 def _takes(path: Path, sensors: Mapping[Place, Sensor], fps: float, whole: bool) -> Iterator[Take]:
     """The episodes of a file."""
     stored = _arrays(path)
-    episodes = flat.split({place: it for place, it in stored.items() if place not in _OWN}, str(path), whole)
+    episodes = flat.split({place: it for place, it in stored.items() if not _is_own(place, it)}, str(path), whole)
     single = {key: _load(path, key) for key in (TASK, START) if (key,) in stored and stored[key,].shape == ()}
     start_ns = int(single[START]) if START in single else None
     for number, (start, stop) in enumerate(episodes.spans):
