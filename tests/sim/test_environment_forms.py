@@ -127,6 +127,17 @@ def test_what_is_no_picture_is_named(picture):
     assert "rgb" not in world.spec.channels and "pictures (its render() gives" in lines
 
 
+def test_a_render_mode_without_a_picture_is_named_and_one_with_depth_is_drawn():
+    made = type("Plain", (Plain,), {"render_mode": None})
+    assert "pictures (it was made with render_mode=None, not 'rgb_array')" in " ".join(
+        describe(GymnasiumWorld(made).spec)
+    )
+    bare = type("Plain", (Plain,), {"render_mode": None, "metadata": None})
+    assert "rgb" not in GymnasiumWorld(bare).spec.channels
+    deep = type("Plain", (Plain,), {"render_mode": "rgbd_tuple", "render": lambda self: (RGB, DEPTH)})
+    assert "rgb" in GymnasiumWorld(deep).spec.channels
+
+
 def test_the_form_in_which_pictures_are_drawn_is_named():
     assert (
         "pictures of 24x32 (drawn as float64 [24, 32] up to 1)"

@@ -59,13 +59,16 @@ def world():
 
 def test_episodes_in_processes_are_those_that_the_environment_plays_alone(world):
     """With the same seeds, also after one has ended and begun anew in its place; and there are no more processes than episodes."""
-    env, chance, alone = as_env(world, 3), make_rng(5), [walker() for _ in range(3)]
+    env, alone = as_env(world, 3), [walker() for _ in range(3)]
     observations, _ = env.reset(seed=5)
+    chance = torch.Generator()
+    chance.set_state(env._rng.get_state())
 
-    def begin(single):
+    def begin(single, chance=chance):
         return single.reset(seed=int(torch.randint(2**31 - 1, (1,), generator=chance)))[0][0]
 
-    places, ended, ends = [begin(single) for single in alone], [False] * 3, 0
+    places = [begin(single, make_rng(5 + place)) for place, single in enumerate(alone)]
+    ended, ends = [False] * 3, 0
     actions = np.random.default_rng(0)
     for step in range(60):
         assert observations[:, 0].tolist() == places, step

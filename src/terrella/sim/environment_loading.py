@@ -4,7 +4,7 @@ import os
 import re
 import runpy
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
     with explained(f"gym:{env}", "made", module):
         try:
             built = gymnasium.make(env, **options)
-            if rgb and "rgb_array" in (built.metadata.get("render_modes") or ()):
+            if rgb and "rgb_array" in _render_modes(built):
                 built.close()
                 built = gymnasium.make(env, render_mode="rgb_array", **options)
                 use_tracking_camera(built)
@@ -101,10 +101,21 @@ def _ended(error: Exception) -> str:
     return first if first.endswith("?") else f"{first}."
 
 
+def renders_pictures(env: gymnasium.Env) -> bool:
+    """Whether `render()` gives a picture of the moment."""
+    mode = str(env.render_mode)
+    return mode.startswith("rgb") and not mode.endswith("_list")
+
+
+def _render_modes(env: gymnasium.Env) -> Sequence[str]:
+    return (getattr(env, "metadata", None) or {}).get("render_modes") or ()
+
+
 def first_picture(env: gymnasium.Env, name: str, pictures: DrawnPictures) -> tuple[tuple[int, int] | None, str]:
     """((height, width) of the picture of an environment after a reset or None, why there is none)."""
-    if env.render_mode != "rgb_array":
-        return None, ""
+    if not renders_pictures(env):
+        made = f"it was made with render_mode={env.render_mode!r}, not 'rgb_array'"
+        return None, made if "rgb_array" in _render_modes(env) else ""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # its greeting would mix with our output
     with explained(name, "drawn"):
         try:

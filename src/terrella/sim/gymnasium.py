@@ -21,7 +21,7 @@ from ..core.state import State
 from ..core.world import make_rng
 from .drawn_pictures import DrawnPictures
 from .environment_facts import EnvironmentFacts, facts_of
-from .environment_loading import build, explained, first_picture
+from .environment_loading import build, explained, first_picture, renders_pictures
 from .observation_channels import check_space, entry_at, label_of, parts_of, resized, space_of, value_at
 from .processes import MAX_EPISODES, Processes
 from .snapshot import NotCopyable, Snapshots
@@ -129,14 +129,15 @@ class GymnasiumWorld:
         self._name, self._repeat = config.name or own_name, repeat
         self._size, self._info = check_size(config.size), tuple(config.info_channels)
         check_space(self._env.action_space, self._name)
-        renders = rgb and self._env.render_mode == "rgb_array"
+        renders = rgb and renders_pictures(self._env)
         with explained(self._name, "reset"):
             seen, info = self._env.reset(seed=0)
         self._parts = parts_of(self._env.observation_space, seen, rgb, renders, self._info)
         if not self._parts.arrays and not renders:
             check_space(self._env.observation_space, self._name)
         self._snapshots, self._viewer = None, self._env
-        if config.forkable is not False:
+        texts_change = self._parts.text is not None  # with the episode, which a trial may not show
+        if config.forkable or (config.forkable is None and not texts_change):
             self._try_forking(build(env, rgb, options)[0], config.snapshots or Snapshots, bool(config.forkable))
         self._ticket = 0
         self._processes: Processes | None = None
