@@ -286,6 +286,11 @@ def all_lost(folder, doc):
         file.unlink()
 
 
+def some_lost(folder, doc):
+    for number in (3, 5, 7, 9, 11):
+        (folder / f"{number:03d}.png").unlink()
+
+
 def no_picture(folder, doc):
     (folder / "003.png").write_bytes(b"nothing of the kind")
 
@@ -321,6 +326,7 @@ def wrong_poses(folder, doc):
         (no_focus, "no sensible size or focal length"),
         (unknown_model, "ORTHOPHOTO"),
         (all_lost, "none of its 20 pictures is there, such as 000.png"),
+        (some_lost, "15 posed pictures (left out: 003.png (absent), 005.png (absent)"),
         (no_picture, "003.png cannot be read as a picture"),
         (cut, "003.png cannot be read as a picture"),
         (tiny, "003.png is 5 x 5 pixels"),
