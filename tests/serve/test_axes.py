@@ -64,6 +64,12 @@ def test_a_held_key_overrides_its_axis_alone():
     assert action_of(spec, ("KeyW",), [0.5, 1.0, 0.0]).tolist() == [[2.0, 1.0, 0.0]]
 
 
+@pytest.mark.parametrize("held", [("KeyW", "KeyS"), ("KeyS", "KeyW")])
+def test_of_two_opposite_keys_the_positive_one_counts(held):
+    spec = Robot(keys={"KeyW": [1.0, 0.0, 0.0], "KeyS": [-1.0, 0.0, 0.0]}).spec
+    assert action_of(spec, held).tolist() == [[1.0, 0.0, 0.0]]
+
+
 def test_of_several_choices_each_obeys_the_key_pressed_last():
     spec = spec_of(spaces.MultiDiscrete([3, 3, 2]), idle=(0.0, 1.0, 0.0))
     keys = {"KeyA": [1.0, 1, 0], "KeyD": [2.0, 1, 0], "KeyW": [0.0, 0, 0], "Space": [0.0, 1, 1]}

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from terrella.core.errors import ProtocolError
 from terrella.serve import protocol
+from terrella.serve.actions import MAX_AXES
 from terrella.serve.history import Image
 from terrella.serve.protocol import HeldControls, Show
 
@@ -80,6 +81,13 @@ def test_no_field_crashes_the_reader(value):
             protocol.parse_message(json.dumps(body))
         except ProtocolError as error:
             assert str(error)
+
+
+def test_a_page_sends_as_many_axes_as_it_shows_and_no_more():
+    read = lambda many: protocol.parse_message(json.dumps({"type": "controls", "id": 1, "axes": [0.5] * many}))  # noqa: E731
+    assert read(MAX_AXES) == ("controls", HeldControls(1, (), (0.5,) * MAX_AXES))
+    with pytest.raises(ProtocolError, match=f"at most {MAX_AXES}"):
+        read(MAX_AXES + 1)
 
 
 def test_every_message_is_understood():

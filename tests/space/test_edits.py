@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -58,6 +60,15 @@ def test_objects_and_brushes_are_selected():
     assert sorted(brush.gaussians.means[58:, 0].tolist()) == sorted(apart.gaussians.means[58:, 0].tolist())
     with pytest.raises(ContractError):
         apply_edits(scene, [{"select": {"object": 0}, "do": "delete"}], objects)
+
+
+@pytest.mark.parametrize("radius", [0.5, 2.0])
+@pytest.mark.parametrize("kind", ["sphere", "brush"])
+def test_a_brush_selects_what_is_nearer_than_its_radius(kind, radius):
+    scene = cloud(2)
+    scene = replace(scene, means=torch.tensor([[0.99 * radius, 0, 0], [0, 1.01 * radius, 0]]))
+    edit = {"select": {kind: [0, 0, 0, radius]}, "do": "delete"}
+    assert apply_edits(scene, [edit]).origin.tolist() == [1]
 
 
 @pytest.mark.parametrize("edit", [

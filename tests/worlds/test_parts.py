@@ -9,7 +9,7 @@ import torch
 
 from terrella.core import State, chance, make_rng
 from terrella.core.errors import ObservationError
-from terrella.worlds.body import NoBody
+from terrella.worlds.body import FASTEST_M, NoBody
 from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
@@ -130,6 +130,25 @@ def test_a_body_stands_still_moves_and_ends(world):
     assert set(step) == set(begun), "each step gives all that a body has"
     ends = body.ends(after, numbers)
     assert ends.shape == (B,) and ends.dtype == torch.bool and body.history <= world.history and body.half_m >= 0
+
+
+def test_a_body_that_evidence_puts_far_away_has_no_speed():
+    body = place(BUTTONS).body
+    prior = State({"pose": torch.zeros(2, 7), "speed": torch.zeros(2, 2), "dreamt": torch.zeros(2, dtype=torch.bool)})
+    pose = torch.zeros(2, 7)
+    pose[:, 0] = torch.tensor([0.99, 1.01]) * FASTEST_M
+    speed = body.observe(prior, Evidence(2, torch.device("cpu"), pose))["speed"]
+    assert torch.allclose(speed, torch.tensor([[0.99 * FASTEST_M, 0.0], [0.0, 0.0]]))
+
+
+def test_an_episode_that_is_over_is_drawn_no_more():
+    before, _, _ = walked(world := place(BUTTONS))
+    over = torch.tensor([True, False, True])
+    before = before.replace(done=over)
+    after = world.imagine(before, world.spec.sample_action(B, make_rng(4)), make_rng(5))
+    shown = [newest_frame(state)[over] for state in (before, after)]
+    assert torch.equal(*shown) and torch.equal(before["uncertainty"][over], after["uncertainty"][over])
+    assert not torch.equal(newest_frame(before)[~over], newest_frame(after)[~over])
 
 
 def test_a_scene_starts_looks_takes_the_frame_and_renders(world):
