@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import io
+import json
 import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,7 +17,10 @@ from PIL import Image
 from terrella.core.errors import TerrellaError
 from terrella.measure import LONG, ExamConfig, strip, write_report
 from terrella.measure.plot import Line, line_chart
+from terrella.measure.scorecard import Curve
+from terrella.measure.statistics import Band
 from terrella.measure.strip import jpeg
+from terrella.measure.verdict import good_for
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +54,38 @@ def test_the_report_stands_alone(card, tmp_path):
         assert f"<h2>{heading}</h2>" in html
     for svg in re.findall(r"<svg .*?</svg>", html):
         ElementTree.fromstring(re.sub(r"class=key", 'class="key"', svg))
+
+
+def test_a_film_of_truth_over_dream_comes_first_and_figures_are_folded(card, tmp_path):
+    html = write_report(card, tmp_path, "A world")[1].read_text(encoding="utf-8")
+    data = re.search(r'src="data:image/webp;base64,([^"]+)"', html)
+    assert data and html.index("Good for") < html.index("<table") and data.start() < html.index("Good for")
+    film = Image.open(io.BytesIO(base64.b64decode(data[1])))
+    height, width = card.films[0].truth.shape[1:3]
+    assert film.size == (width, 2 * height + 4) and film.n_frames > 8 and film.info["loop"] == 0
+    assert html.index("<details class=more>") < html.index("<table"), "technical rows are under More"
+    assert html.count("data-head=") > 20, "on a phone each figure is named"
+    assert "films" not in json.loads((tmp_path / "scorecard.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("gains", "words"),
+    [
+        ([(1, 2)] * 10, "Good for at least 1.0 seconds"),
+        ([(1, 2)] * 4 + [(-1, 1)] * 2 + [(-2, -1)] * 4, "Good for about 0.4 seconds"),
+        ([(1, 2)] * 2 + [(-2, -1)] * 2 + [(1, 2)] * 6, "Good for about 0.2 seconds"),
+        ([(-1, 1)] * 10, "Not yet better than repeating the last picture"),
+    ],
+)
+def test_it_is_good_for_as_long_as_it_is_better_without_a_break(card, gains, words):
+    low, high = (np.array([gain[end] for gain in gains], float) for end in (0, 1))
+    arm = next(iter(card.worlds))
+    band = Band((low + high) / 2, low, high, 5)
+    curve = Curve(
+        "pixels", "rgb", "pooled PSNR: gain over copy-last", "dB", "recorded", arm, "predicted", range(1, 11), band
+    )
+    assert good_for(replace(card, dt_s=0.1, curves=[curve])) == words
+    assert good_for(replace(card, curves=[])) == ""
 
 
 def test_a_report_that_cannot_be_written_is_one_sentence(card, tmp_path):

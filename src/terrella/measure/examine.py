@@ -63,6 +63,7 @@ def examine(
         card.rows.extend(report.rows)
         card.curves.extend(report.curves)
         card.pictures.extend(report.pictures)
+        card.films.extend(report.films)
     return card
 
 

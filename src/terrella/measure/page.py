@@ -1,4 +1,4 @@
-"""One self-contained HTML page of a scorecard: the verdict, then each probe's curves, pictures and figures, and the method."""
+"""One self-contained HTML page of a scorecard: a film and the verdict, pictures, and behind a fold all figures and the method."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .page_parts import charts_of, document, figure_table, number, picture_of, section, steps_words, table_of
+from .page_parts import charts_of, document, figure_table, film_of, number, picture_of, section, steps_words, table_of
 from .scorecard import COPY_LAST, Row, Scorecard, place_label
-from .verdict import BETTER, WORSE, compared, gain_verdict, verdict
+from .verdict import BETTER, WORSE, compared, gain_verdict, good_for, verdict
 
 if TYPE_CHECKING:
     from .exam import Probe
@@ -21,12 +21,29 @@ def page(card: Scorecard, title: str, probes: Sequence[Probe]) -> str:
         f"{place.clips} {escape(place_label(place.name))} ({place.moving_share:.0%} moving)" for place in card.places
     )
     worlds = " &middot; ".join(f"{escape(arm)}: {escape(name)}" for arm, name in card.worlds.items())
-    sections = [_verdict(card), *(_section(card, probe) for probe in probes), _missing(card), _method(card)]
-    return document(title, sections, f"<p>{places}</p><p>{worlds}</p>")
+    figures = [_gains(card), *(_section(card, probe) for probe in probes), _missing(card), _method(card)]
+    about = f"<p>{places}</p><p>{worlds}</p>"
+    summary = "<summary>More: all figures, and how they were measured</summary>"
+    more = f"<details class=more>{summary}{about}{''.join(figures)}</details>"
+    return document(title, [_hero(card), _pictures(card), more])
 
 
-def _verdict(card: Scorecard) -> str:
-    """The verdict, and a table of gains over copying the last frame, filled if the whole interval has one sign."""
+def _hero(card: Scorecard) -> str:
+    """A film of truth over dream, for how long the world is good, and the verdict."""
+    why = "So long its pictures are clearly better than a repeated last picture, with the same actions as in the recording."
+    words = good_for(card)
+    why = f"<p>{why}</p>" if words.startswith("Good") else ""
+    text = f"<div class=good><h2>{escape(words)}</h2>{why}<p>{escape(verdict(card)[0])}</p></div>"
+    return f"<section class=hero>{''.join(map(film_of, card.films[:1]))}{text}</section>"
+
+
+def _pictures(card: Scorecard) -> str:
+    shown = "".join(picture_of(picture) for picture in card.pictures if picture.probe == "pixels")
+    return section("What it predicts", "The first row is the recording; the others are predicted.", shown)
+
+
+def _gains(card: Scorecard) -> str:
+    """A table of gains over copying the last frame, filled if the whole interval has one sign."""
     rows, lines = compared(card), []
     steps = sorted({row.horizon for row in rows})
     for kind in dict.fromkeys((row.channel, row.what, row.unit, row.place) for row in rows):
@@ -35,8 +52,7 @@ def _verdict(card: Scorecard) -> str:
         about = f"{escape(f'{kind[0]} {kind[1]}{unit}')}<small>{escape(place_label(kind[3]))}</small>"
         lines.append([about, *(_gain(mine[step]) if step in mine else "" for step in steps)])
     heads = ["gain over copying the last frame", *(steps_words(step) for step in steps)]
-    inside = table_of(heads, lines) if lines else ""
-    return f"<section><h2>{escape(verdict(card)[0])}</h2>{inside}</section>"
+    return section("Gain over copying the last frame", "", table_of(heads, lines) if lines else "")
 
 
 def _gain(row: Row) -> str:
@@ -51,7 +67,9 @@ def _gain(row: Row) -> str:
 def _section(card: Scorecard, probe: Probe) -> str:
     rows = [row for row in card.rows if row.probe == probe.name]
     control = [row for row in card.rows if row.probe == "control"] if probe.name == "drift" else []
-    pictures = "".join(picture_of(picture) for picture in card.pictures if picture.probe == probe.name)
+    pictures = "".join(
+        picture_of(picture) for picture in card.pictures if picture.probe == probe.name and probe.name != "pixels"
+    )
     charts = charts_of(card, probe.name)
     inside = charts + pictures + figure_table(rows, card.dt_s, open_=not charts)
     whole = section(probe.question, escape(probe.lead), inside)

@@ -2,6 +2,7 @@
 
 import base64
 import math
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -9,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from .plot import Line, line_chart, y_span
-from .scorecard import COPY_LAST, TRUE, Curve, Picture, Row, Scorecard, place_label
+from .scorecard import COPY_LAST, TRUE, Curve, DreamFilm, Picture, Row, Scorecard, place_label
 from .statistics import Figure
-from .strip import join_row, jpeg
+from .strip import film, join_row, jpeg
 
 COLOURS = ("#6fd3c1", "#e3a857", "#8ea6ff", "#e07a9b", "#b6d36f")
 QUIET = "#8b93a3"
@@ -77,8 +78,13 @@ def named(arm: str, motion: str) -> str:
 def table_of(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of HTML cells; the first column is text, the others numbers aligned right."""
 
+    plain = [re.sub(r"<[^>]+>", " ", head).strip() for head in heads]  # for phones, where each cell has its own
+
     def cells(tag: str, row: Sequence[str]) -> str:
-        return "".join(f"<{tag}{' class=n' if place else ''}>{cell}</{tag}>" for place, cell in enumerate(row))
+        named = [
+            f' class=n data-head="{plain[place]}"' if place and tag == "td" else " class=n" for place in range(len(row))
+        ]
+        return "".join(f"<{tag}{named[place] if place else ''}>{cell}</{tag}>" for place, cell in enumerate(row))
 
     body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return f"<div class=scroll><table><thead><tr>{cells('th', heads)}</tr></thead><tbody>{body}</tbody></table></div>"
@@ -161,6 +167,16 @@ def picture_of(picture: Picture) -> str:
     rows = "".join(f"<h4>{escape(label)}</h4>{_image(frames, label)}" for label, frames in picture.rows.items())
     inside = f'<div style="min-width:{least}px;max-width:{most}px"><div class=columns>{heads}</div>{rows}</div>'
     return f"<div class=strip><h3>{escape(picture.title)}</h3><div class=scroll>{inside}</div></div>"
+
+
+def film_of(shown: DreamFilm) -> str:
+    """A film, the recording above the prediction."""
+    height, width = shown.truth.shape[1:3]
+    data = base64.b64encode(film([shown.truth, shown.dream], shown.dt_s)).decode()
+    return (
+        f'<figure class=film style="aspect-ratio:{width}/{2 * height + 4}"><img alt="The recording above, the prediction below" '
+        f'src="data:image/webp;base64,{data}"><figcaption><span>truth</span><span>dream</span></figcaption></figure>'
+    )
 
 
 def _image(frames: np.ndarray, label: str) -> str:

@@ -15,7 +15,19 @@ from .exam import CLIPS, ENDINGS, LONG, Exam, ExamResults, Probe, batches
 from .fidelity import blurred, changes, gradient_energy, pooled, psnr, squared_error, ssim
 from .frechet import frechet_interval
 from .rollouts import Results, StepMetric, Tick, rows_at
-from .scorecard import CHANGE, COPY_LAST, POOLED, PREDICTED, TRUE, Curve, Picture, ProbeReport, Row, place_label
+from .scorecard import (
+    CHANGE,
+    COPY_LAST,
+    POOLED,
+    PREDICTED,
+    TRUE,
+    Curve,
+    DreamFilm,
+    Picture,
+    ProbeReport,
+    Row,
+    place_label,
+)
 from .statistics import Figure, mean_interval, ratio_band, ratio_interval
 from .work_units import Unit
 
@@ -29,6 +41,7 @@ LEAD = (
 )
 _MIN_SSIM = 11  # pixels, the window of SSIM
 _CHANGE_STEPS = 8  # over which changes are counted
+_FILM_SIDE = 256  # pixels; larger frames are thinned for the film
 
 
 def series(
@@ -80,6 +93,7 @@ class _FrameMetrics:
             kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
             kept[f"{name}/change"] = _count(changes(last if step == 1 or self.before is None else self.before, mine))
             self.before = mine
+            kept[f"{name}/film"] = _smaller(mine[: self.strips])
         if step in self.horizons:
             if min(mine.shape[1:3]) >= _MIN_SSIM:
                 kept[f"{name}/ssim"] = ssim(mine, truth)
@@ -87,6 +101,27 @@ class _FrameMetrics:
                 kept[f"{name}/features"] = frame_features(mine)
             kept[f"{name}/frames"] = mine[: self.strips]
         return kept
+
+
+def _smaller(frames: torch.Tensor) -> torch.Tensor:
+    """Frames [B, H, W, 3] with at most _FILM_SIDE pixels a side."""
+    step = -(-max(frames.shape[1:3]) // _FILM_SIDE)
+    return frames[:, ::step, ::step]
+
+
+def _film(exam: Exam, place: str, clips: Sequence[Clip], name: str, dreams: torch.Tensor) -> DreamFilm | None:
+    """Of the predicted `dreams` [B, T, H, W, 3] of the first clips, the one in which most happens; None without any."""
+    films = []
+    for clip, dream in zip(clips, dreams):
+        rows = range(clip.context, clip.context + len(dream))
+        truth = _smaller(torch.from_numpy(np.stack([np.asarray(clip.channels[name][row]) for row in rows]))).numpy()
+        films.append(
+            (float(np.abs(np.diff(truth.astype(np.float32), axis=0)).mean()), len(films), truth, dream.numpy())
+        )
+    if not films or len(films[0][2]) < 2:
+        return None
+    _, number, truth, dream = max(films, key=lambda film: film[0])
+    return DreamFilm(f"{place_label(place)}, clip {number + 1}", truth, dream, exam.dt_s)
 
 
 def _count(changed: torch.Tensor) -> torch.Tensor:
@@ -152,6 +187,9 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
                         where = "pixels", name, place, arm, motion
                         whole.rows += _rows(exam, where, dreamt, truth)
                         whole.curves.append(_sharpness(exam, where, dreamt, truth))
+                        if motion == PREDICTED and not whole.films and f"{name}/film" in dreamt:
+                            film = _film(exam, place, clips, name, dreamt[f"{name}/film"])
+                            whole.films += [film] if film else []
                         for strip, frames in zip(strips, dreamt[f"{name}/frames"]):
                             now = strip[f"truth, {name}"][:1]
                             strip[f"{arm}, {motion} motion, {name}"] = np.concatenate([now, frames.numpy()])

@@ -63,6 +63,16 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class DreamFilm:
+    """The same moments as they were recorded and as they were predicted, at the pace of the world."""
+
+    title: str
+    truth: np.ndarray  # uint8 [T, H, W, 3]
+    dream: np.ndarray  # uint8 [T, H, W, 3]
+    dt_s: float
+
+
+@dataclass(frozen=True)
 class Missing:
     """A probe that does not apply to an arm, and what it needs: "needs pose"."""
 
@@ -89,11 +99,12 @@ class ProbeReport:
     rows: list[Row] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
+    films: list[DreamFilm] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Scorecard:
-    """All results, as data; `pictures` are for the page and not in the JSON."""
+    """All results, as data; `pictures` and `films` are for the page and not in the JSON."""
 
     worlds: dict[str, str]  # arm -> name of its world
     dt_s: float
@@ -102,6 +113,7 @@ class Scorecard:
     curves: list[Curve] = field(default_factory=list)
     missing: list[Missing] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
+    films: list[DreamFilm] = field(default_factory=list)
 
     def find(self, probe: str, what: str, **wanted) -> list[Row]:
         """The rows of a probe by measure, and by any other fields."""

@@ -37,6 +37,20 @@ def join_row(frames: np.ndarray) -> Image.Image:
     return Image.fromarray(canvas)
 
 
+def film(rows: Sequence[np.ndarray], dt_s: float, last_s: float = 1.0) -> bytes:
+    """An animated WebP that loops: rows of frames uint8 [T, H, W, 3] above one another, each frame for dt_s, the last for last_s
+    more."""
+    gap = np.full((1, 2 * _GAP, *rows[0].shape[2:]), 14, np.uint8)
+    frames = [
+        Image.fromarray(np.concatenate([part for row in rows for part in (gap[0], row[at])][1:]))
+        for at in range(len(rows[0]))
+    ]
+    times, data = [max(20, round(1000 * dt_s))] * len(frames), io.BytesIO()
+    times[-1] += round(1000 * last_s)
+    frames[0].save(data, "WEBP", save_all=True, append_images=frames[1:], duration=times, loop=0, quality=80, method=2)
+    return data.getvalue()
+
+
 def jpeg(picture: Image.Image, quality: int = 88) -> bytes:
     """A picture as JPEG bytes, colours not subsampled."""
     buffer = io.BytesIO()

@@ -24,8 +24,12 @@ def to_json(card: Scorecard) -> str:
 
 def as_dict(card: Scorecard) -> dict:
     """The content of `to_json` as plain data, the verdict first."""
-    names = [part.name for part in dataclasses.fields(card) if part.name != "pictures"]
-    return {"verdict": verdict(card), **{name: _plain(getattr(card, name)) for name in names}}
+    names = [part.name for part in dataclasses.fields(card) if part.name not in ("pictures", "films")]
+    return {
+        "verdict": verdict(card),
+        "good_for": good_for(card),
+        **{name: _plain(getattr(card, name)) for name in names},
+    }
 
 
 def verdict(card: Scorecard) -> list[str]:
@@ -41,6 +45,29 @@ def verdict(card: Scorecard) -> list[str]:
     kinds = dict.fromkeys((row.channel, row.what, row.place) for row in rows)
     lines = (_line([row for row in rows if (row.channel, row.what, row.place) == kind]) for kind in kinds)
     return [f"{name} is {_copying(curves, rows)}{traits}.", *lines]
+
+
+def good_for(card: Scorecard) -> str:
+    """For how long the first arm's main measure stays better than copying the last frame, in a few words; "" if not compared."""
+    arm = next(iter(card.worlds))
+    curves = [
+        curve for curve in card.curves if (curve.arm, curve.motion) == (arm, PREDICTED) and curve.what.endswith(GAIN)
+    ]
+    if not curves:
+        return ""
+    lead = curves[0]
+    same = [
+        curve for curve in curves if (curve.channel, curve.what, curve.place) == (lead.channel, lead.what, lead.place)
+    ]
+    longest = max(same, key=lambda curve: max(curve.x))
+    verdicts = [gain_verdict(longest.band.at(at)) for at in range(len(longest.x))]
+    until = verdicts.index(WORSE) if WORSE in verdicts else len(verdicts)
+    better = [at for at in range(until) if verdicts[at] == BETTER]
+    if not better:
+        return "Not yet better than repeating the last picture"
+    seconds = longest.x[better[-1]] * card.dt_s
+    words = f"{seconds:.0f} seconds" if seconds >= 10 else f"{seconds:.1f} seconds"
+    return f"Good for at least {words}" if better[-1] == len(verdicts) - 1 else f"Good for about {words}"
 
 
 def compared(card: Scorecard) -> list[Row]:

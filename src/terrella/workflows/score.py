@@ -27,6 +27,7 @@ from ..measure import (
     clips_with_endings,
     examine,
     in_box,
+    most_clips_within,
     out_of_sight,
     place_label,
     verdict,
@@ -40,6 +41,7 @@ from .results import jsonable
 CONTEXT = 10  # frames that a world observes before it predicts: longer than the effect of a key lasts
 DRIFT_STEPS, DRIFT_CLIPS, ENDING_CLIPS = 256, 24, 24
 QUICK_CLIPS, QUICK_HORIZONS, HORIZONS = 6, (1, 8, 32), (1, 8, 32, 64)
+QUICK_S = 50.0  # of the examination with `quick`, by its forecast
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,9 @@ class ScoreConfig:
     new: Path | None = None
     """A recording of places that training never saw; default: the part of the map that training kept out."""
     fresh: bool = False  # Use every episode of `data`: for a recording that training never used.
-    quick: bool = False  # Take about a minute: fewer clips, shorter horizons, and the world with its memory only.
+    quick: bool = False
+    """Take about a minute once the recording is read: as many clips as fit (2 to 6), shorter horizons, and the world with its
+    memory only."""
     out: Path = Path("scores")  # Folder for scorecard.json and scorecard.html.
     clips: int | None = None  # Clips of each kind of place; default 50, quick 6. Intervals need 50 or more.
     horizons: tuple[int, ...] = ()
@@ -105,6 +109,8 @@ def score(world: str | Path, config: ScoreConfig, *, progress: Progress = silent
     drift = 0 if config.quick and config.drift is None else config.drift
     request = ExamRequest(arms, closing, config.data, config.new, config.fresh, clips, drift, config.seed)
     exam, identity = exam_of(request, exam_config, progress)
+    if config.quick and config.clips is None:
+        exam = exam.of(most_clips_within(exam, QUICK_S, range(2, QUICK_CLIPS + 1)))
     identity += f" fast={config.fast} device={device_of(config.device)}"
     with stage("scoring", progress) as report:
         card, files = write_card(name, exam, identity, Path(config.out), report)
