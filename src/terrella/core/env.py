@@ -55,6 +55,7 @@ class WorldEnv(VectorEnv):
         more = [name for name in ("reward", "done") if name in spec.channels]
         self._asked = tuple(dict.fromkeys((*self._names, *more)))
         self.world, self.num_envs, self.max_steps = world, num_envs, max_steps
+        self._max_episode_steps = max_steps  # as TimeLimit calls it, for `call("_max_episode_steps")`
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         shown = {name: spec.channels[name] for name in self._names}
         self.single_observation_space = shown[self._names[0]] if self._single else spaces.Dict(shown)

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import math
+import re
 from collections.abc import Iterator
 from operator import attrgetter
 from textwrap import dedent
@@ -42,6 +43,7 @@ _COUNTS = (
     "action_repeat",
 )
 _FRAMES = ("render_fps", "video.frames_per_second")
+_UNIT = re.compile(r"\s*(fps|hz)\s*$", re.IGNORECASE)
 _TRIAL_STEPS, _LONGEST_S = 3, 60.0
 
 
@@ -179,9 +181,9 @@ def _at(env: gymnasium.Env, path: str) -> Any:
 
 
 def _number(value: Any) -> float | None:
-    """A positive finite number, or text that spells one; else None."""
+    """A positive finite number, or text that spells one ("30", "30 fps"); else None."""
     try:
-        number = float(value) if isinstance(value, str) else single_number(value, "")
+        number = float(_UNIT.sub("", value)) if isinstance(value, str) else single_number(value, "")
     except (TerrellaError, ValueError):
         return None
     return number if not isinstance(value, bool) and 0 < number < math.inf else None

@@ -38,7 +38,8 @@ class ObservationPart:
         """The value; a picture becomes uint8 [H, W, 3]. TerrellaError where its shape differs from the space."""
         value = np.asarray(entry_at(observation, self.path, name))
         if self.form:
-            return as_picture(value, self.form, name, white=float(np.max(self.space.high)))  # pyright: ignore[reportAttributeAccessIssue]
+            white = float(self.space.high.flat[0])  # pyright: ignore[reportAttributeAccessIssue]
+            return as_picture(value, self.form, name, white)
         try:
             return np.array(value, dtype=self.space.dtype).reshape(self.space.shape or ())
         except (ValueError, TypeError) as error:
