@@ -49,6 +49,53 @@ def test_it_keeps_the_contract():
     assert {"batches", "states_can_be_saved"} <= set(check_world(world(codec()), steps=3))
 
 
+def foggy(generator: Codec) -> LearnedWorld:
+    """With a ground of 60 x 40 pixels, of which the starts are parts."""
+    ground = torch.randint(0, 256, (4, 40, 60), dtype=torch.uint8, generator=make_rng(3)).clamp_min(1)
+    places = [(0, 0), (12, 6), (36, 24), (20, 12)]
+    frames = torch.stack([ground[:3, y : y + SIZE[0], x : x + SIZE[1]] for x, y in places])
+    starts = StartClips.of(frames[:, None].repeat(1, SLOTS, 1, 1, 1), 2)
+    config = HistoryConfig(SIZE, SLOTS, 2, tuple(map(tuple, MOVES.tolist())), fog_px=2)
+    scene = FrameHistory(config, starts, None, ground)
+    return LearnedWorld(About("made", Controls.buttons(2), 0.1), scene=scene, generator=generator)
+
+
+def scrolling(move: int) -> Codec:
+    """Whose pictures always go on by one of the moves."""
+    made = codec(wild=False)
+    made.scrolling.votes.bias.data = 20.0 * torch.nn.functional.one_hot(torch.tensor(move), len(MOVES)).float()
+    return made
+
+
+@pytest.mark.parametrize("wild", [False, True])
+def test_over_its_ground_a_world_shows_what_was_recorded(wild):
+    """However it scrolls and whatever its codec would paint: what comes into the picture is as the recordings saw it."""
+    generator = scrolling(2)
+    if wild:
+        torch.nn.init.normal_(generator.choice.weight)
+    made, rng = foggy(generator), make_rng(0)
+    picture = made.scene.ground[None, :3, 20 : 20 + SIZE[0], 12 : 12 + SIZE[1]].permute(0, 2, 3, 1)
+    state = made.observe({"rgb": picture}, None, rng)
+    for step in range(1, 7):
+        state = made.imagine(state, torch.zeros(1, 2, dtype=torch.int8), rng)
+        assert state["place"].tolist() == [[12, 20 + 3 * step]]
+        seen = made.render(state, ("rgb", "known"))
+        there = max(0, 40 - 20 - 3 * step)
+        assert (seen["known"][0, :there] == 1).all() and (seen["known"][0, there:] == 0).all()
+        truth = made.scene.ground[:3, 20 + 3 * step :, 12 : 12 + SIZE[1]].permute(1, 2, 0)
+        assert (seen["rgb"][0, : min(there, SIZE[0])] == truth[: SIZE[0]]).all() or wild
+    assert seen["rgb"][0, 8:].float().std((0, 1)).max() < 1, "beyond the ground there is fog alone"
+
+
+def test_a_world_with_a_ground_keeps_the_contract_and_is_saved(tmp_path):
+    made = foggy(codec())
+    assert {"batches", "states_can_be_saved"} <= set(check_world(made, steps=3)) and "known" in made.spec.channels
+    save_world(made, tmp_path / "world")
+    loaded = load_world(tmp_path / "world")
+    assert torch.equal(loaded.scene.ground, made.scene.ground) and loaded.scene.config == made.scene.config
+    assert "known" not in world(codec()).spec.channels, "an older world shows what it invents"
+
+
 def test_where_the_picture_scrolls_the_mosaic_is_shown_with_the_picture_in_its_middle():
     made, rng = world(codec()), make_rng(0)
     state = made.imagine(made.start(2, rng), torch.zeros(2, 2, dtype=torch.int8), rng)

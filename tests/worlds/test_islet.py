@@ -7,6 +7,7 @@ import torch
 
 import terrella
 from terrella.core import World
+from terrella.space.ground import window
 from terrella.space.matching import scroll_index
 
 
@@ -42,6 +43,19 @@ def test_the_picture_scrolls_as_it_is_told(world, action, way):
     went = torch.stack([moves[scroll_index(one, other, moves)] for one, other in zip(seen, seen[1:])])
     moved = went[(went != 0).any(2)]
     assert len(moved) > 10 and (moved == torch.tensor(way)).all(1).float().mean() > 0.7
+
+
+@pytest.mark.parametrize("action", ["up", pytest.param("left", marks=pytest.mark.slow)])
+def test_a_walk_in_one_direction_stays_on_the_island(world, action):
+    """After 40 steps, where streaks used to fill the picture, it shows what the recordings saw there."""
+    rng, number = terrella.make_rng(0), world.spec.action_names.index(action)
+    state = world.start(3, rng)
+    for _ in range(40):
+        state = world.imagine(state, torch.full((3,), number), rng)
+    scene, frame = world.scene, state["frames"][:, 0]
+    there = window(scene.ground, state["place"], scene.config.size)
+    same = ((there[:, :3].int() - frame.int()).abs().amax(1) <= 8)[:, ~scene.over]
+    assert (same.float().mean(1) > 0.8).all() and float(world.render(state, ("known",))["known"].mean()) > 0.9
 
 
 @pytest.mark.slow

@@ -12,14 +12,18 @@ import torch
 import torch.nn.functional as F
 
 from ..core.files import write_json
+from ..space.ground import joined
 from ..space.matching import gather_sources, half_pixel_bounds, scroll_index
 from ..space.mosaic import empty_mosaic, update_mosaic
+from .recording import Recording
 
 REACH, NEAR = 24, 5  # pixels of the longest move in a step, and those up to which all moves are tried at full size
 BLOCK = 8  # pixels
 DIFFERENT = 4.0  # mean difference (of 255) above which a block has changed
 MOVE_COST = 0.05  # by which each pixel of a move must reduce the error
 SAME = 8  # difference of 255 up to which a pixel is unchanged
+GROUND = 9  # height and width of the canvas on which an episode's pictures are stitched, in pictures
+STITCHED = 12_000  # frames at most
 FEWEST = 32  # scrolling pairs needed to find the overlay
 STATISTICS = "looks.json"  # in the folder of a run
 
@@ -144,6 +148,24 @@ def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real:
         joined = update_mosaic(mosaic, now, moves[scroll_index(before, now, moves)], over)
         mosaic = torch.where(real[:, step, None, None, None], joined, mosaic)
     return mosaic
+
+
+def ground_of(recording: Recording, moves: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
+    """The ground (space/ground.py) over which the recording's episodes for training scrolled, uint8 [4, H, W]: their pictures
+    stitched, and those of several episodes where they overlap."""
+    wholes, rows_left = [], STITCHED
+    for first, last in (recording.cache.episodes[episode] for episode in recording.seen):
+        before, whole = recording.rgb([first]), None
+        for row in range(first, min(last, first + rows_left)):
+            frame = recording.rgb([row])
+            size = [GROUND * side for side in frame.shape[-2:]]
+            whole = torch.zeros(1, 4, *size, dtype=torch.uint8) if whole is None else whole
+            whole = update_mosaic(whole, frame, moves[scroll_index(before, frame, moves)], over)
+            before = frame
+        rows_left -= last - first
+        if whole is not None:
+            wholes.append(whole[0])
+    return joined(wholes)
 
 
 def _around(plane: torch.Tensor) -> torch.Tensor:

@@ -38,7 +38,7 @@ def update_mosaic_slowly(
     agree, outvoted = same & (votes > 0), votes > 1
     colour = torch.where(agree | outvoted, seen[:, :3], frame)
     votes = torch.where(agree, (votes + 1).clamp_max(MOST), torch.where(outvoted, votes - 1, 1))
-    top, left = _corner(mosaic, size)
+    top, left = middle(mosaic, size)
     joined = torch.where(over, seen, torch.cat([colour, votes.to(torch.uint8)], 1))
     after[..., top : top + size[0], left : left + size[1]] = joined
     return after
@@ -53,7 +53,7 @@ def read_mosaic(mosaic: torch.Tensor, size: tuple[int, int], move: torch.Tensor)
 def _window(mosaic: torch.Tensor, move: torch.Tensor, size) -> torch.Tensor:
     """The middle `size` of mosaics displaced by `move`."""
     tall, wide = mosaic.shape[-2:]
-    top, left = _corner(mosaic, size)
+    top, left = middle(mosaic, size)
     y = torch.arange(top, top + size[0], device=mosaic.device) - move[:, 1:]
     x = torch.arange(left, left + size[1], device=mosaic.device) - move[:, :1]
     inside = ((y >= 0) & (y < tall))[:, :, None] & ((x >= 0) & (x < wide))[:, None]
@@ -62,12 +62,13 @@ def _window(mosaic: torch.Tensor, move: torch.Tensor, size) -> torch.Tensor:
     return window * inside[:, None]
 
 
-def _corner(mosaic: torch.Tensor, size) -> tuple[int, int]:
+def middle(mosaic: torch.Tensor, size) -> tuple[int, int]:
+    """Row and column of a mosaic at which the picture in its middle begins."""
     return (mosaic.shape[-2] - size[0]) // 2, (mosaic.shape[-1] - size[1]) // 2
 
 
 def write_mosaic(mosaic: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
     """`mosaic` with the seen pixels of `seen`, uint8 [B, 4, H, W], written to its middle."""
-    top, left = _corner(mosaic, seen.shape[-2:])
+    top, left = middle(mosaic, seen.shape[-2:])
     margin = left, mosaic.shape[-1] - left - seen.shape[-1], top, mosaic.shape[-2] - top - seen.shape[-2]
     return torch.where(F.pad(seen[:, 3:], margin) > 0, F.pad(seen, margin), mosaic)

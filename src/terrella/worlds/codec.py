@@ -13,6 +13,7 @@ from torch import nn
 
 from ..space.matching import (
     FEW,
+    SAME,
     clear_index,
     edge_shares,
     gather_sources,
@@ -27,6 +28,7 @@ COARSE = 4  # side in pixels of the squares that the trunk sees; choices are mad
 PIXEL = 16  # features of each pixel from its square, and as many from its neighbours
 HIDDEN = 32  # features of each pixel that its choice is read from
 CHANCE = 0.25  # temperature: 1 samples frames by their probability, 0 takes the likeliest
+THING = 23  # side in pixels of a square, larger than most of the things before a ground
 AROUND = 8  # side in pixels of the squares in and around which colours are counted
 UNKNOWN = -1e4  # logit of a source that does not exist
 
@@ -132,17 +134,31 @@ class Codec(nn.Module):
         assert mosaic is not None and over is not None and scroll is not None
         seen = self.seen(_frames(conditioning), mosaic, over, scroll)
         choices, features = self.choices(seen, conditioning.context)
-        drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features).float() / 127.5 - 1
+        if conditioning.evidence:  # what scrolls into the picture is as it was seen
+            comes = (self._beyond(seen.over) & seen.known).gather(1, seen.along[:, None])
+            memory = torch.full_like(choices[:1, :, :1, :1], UNKNOWN)
+            memory[:, -2] = 0
+            choices = torch.where(comes, memory, choices)
+        drawn = self.drawn(seen, choices + CHANCE * shared_chance(noisy, choices), features)
+        if conditioning.evidence:
+            drawn = without_smears(drawn, seen)
+        drawn = drawn.float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
-        """With `scroll`, the move by which most of the picture goes on, where there is a mosaic."""
+        """With `scroll`, the move by which most of the picture goes on, where there is a mosaic; and with what that mosaic then knows
+        of the picture, if it holds evidence alone."""
         if conditioning.mosaic is None:
             return conditioning
         frames, context = _frames(conditioning), conditioning.context
         went = [edge_shares(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
         logits = self.scrolling(self.scrolling.frame_features(frames[:, 0]), context, torch.stack(went, 1))
-        return replace(conditioning, scroll=least_off(logits, self.moves))
+        scroll = least_off(logits, self.moves)
+        if not conditioning.evidence:
+            return replace(conditioning, scroll=scroll)
+        votes = read_mosaic(conditioning.mosaic, self.config.size, self.moves[scroll])[:, 3]
+        known = ((votes > 0) | conditioning.over).float()
+        return replace(conditioning, scroll=scroll, glimpse=replace(conditioning.glimpse, known=known))
 
     def seen(self, frames: torch.Tensor, mosaic: torch.Tensor, over: torch.Tensor, move: torch.Tensor) -> CodecInputs:
         """The inputs where most of the picture goes on by `move` [B]. mosaic: as of frames[:, 0]; over bool [B, H, W]: pixels that
@@ -238,6 +254,16 @@ class Codec(nn.Module):
 def _frames(conditioning: Conditioning) -> torch.Tensor:
     """The last frames, uint8 [B, slots, 3, H, W], the newest first."""
     return (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
+
+
+def without_smears(drawn: torch.Tensor, seen: CodecInputs) -> torch.Tensor:
+    """Frames uint8 [B, 3, H, W] as they were remembered where most of a square of THING pixels differs from that: things are
+    smaller, so it is a smear."""
+    ground = seen.sources[:, -1]
+    other = ((drawn.int() - ground.int()).abs().amax(1, keepdim=True) > SAME) & seen.known
+    smears = F.avg_pool2d(other.float(), THING, 1, THING // 2, count_include_pad=False) > 0.5
+    smears = F.max_pool2d(smears.float(), THING, 1, THING // 2) > 0
+    return torch.where(other & smears, ground, drawn)
 
 
 def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:

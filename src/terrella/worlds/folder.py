@@ -262,7 +262,13 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
         begun = replace(
             begun, actions=starts["actions"], vitals=starts["vitals"], known=starts.get("known", begun.known)
         )
-    return FrameHistory(config, begun, remembered.get("over"))
+    ground = _below(remembered, "ground")
+    if ground:
+        size = 4, *ground["size"].tolist()
+        ground = torch.from_numpy(
+            np.frombuffer(zlib.decompress(ground["bytes"].numpy().tobytes()), np.uint8).reshape(size).copy()
+        )
+    return FrameHistory(config, begun, remembered.get("over"), ground if len(ground) else None)
 
 
 # By part and kind: its settings, and how it is made from them, its weights and the memory.
@@ -292,7 +298,12 @@ def _packed_places(scene: KeyframeScene, quality: int) -> dict[str, torch.Tensor
 def _packed_frames(scene: FrameHistory, quality: int) -> dict[str, torch.Tensor]:
     starts = _pack_frames(scene.starts.frames.flatten(0, 1), max(quality, 99))
     starts |= {name: getattr(scene.starts, name) for name in ("actions", "vitals", "known")}
-    return {**{f"starts.{name}": value for name, value in starts.items()}, "over": scene.over}
+    packed = {**{f"starts.{name}": value for name, value in starts.items()}, "over": scene.over}
+    if scene.config.fog_px:
+        data = zlib.compress(scene.ground.cpu().numpy().tobytes(), 9)
+        packed["ground.bytes"] = torch.from_numpy(np.frombuffer(data, np.uint8).copy())
+        packed["ground.size"] = torch.tensor(scene.ground.shape[1:])
+    return packed
 
 
 # By kind of scene: what it remembers, as tensors for a file.

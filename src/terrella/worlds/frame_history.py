@@ -1,6 +1,8 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
-The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture.
+The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture. With
+`fog_px` the mosaic holds evidence alone: this episode's, and the ground of the recordings where a picture is recognised on it.
+Beyond that, frames are shown as fog.
 """
 
 from __future__ import annotations
@@ -11,15 +13,17 @@ from typing import Any, final
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core import chance
 from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics
+from ..space.ground import ALIKE, NOWHERE, locate, window
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.matching import scroll_index
-from ..space.mosaic import PICTURES, empty_mosaic, update_mosaic, write_mosaic
+from ..space.mosaic import PICTURES, empty_mosaic, middle, update_mosaic, write_mosaic
 from .config import HistoryConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
@@ -46,24 +50,37 @@ class StartClips:
 @final
 class FrameHistory:
     """`starts`: where episodes begin. `over` bool [H, W], default none: pixels that stay while the picture scrolls, such as a
-    status line or the player in the middle; they are no part of the mosaic."""
+    status line or the player in the middle; they are no part of the mosaic. `ground` uint8 [4, H', W'] (space/ground.py), default
+    none: what the recordings scrolled over."""
 
     kind = "history"
     camera: Intrinsics | None = None
     earlier_names: tuple[str, ...] = ()
 
-    def __init__(self, config: HistoryConfig, starts: StartClips, over: torch.Tensor | None = None):
+    def __init__(
+        self,
+        config: HistoryConfig,
+        starts: StartClips,
+        over: torch.Tensor | None = None,
+        ground: torch.Tensor | None = None,
+    ):
         self.config, self.starts = config, starts
         self.device, self.history = starts.frames.device, config.slots
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
-        self.drawn_names: tuple[str, ...] = ("frames", "mosaic", "scroll") if config.moves else ("frames",)
+        self.ground = torch.zeros(4, 1, 1, dtype=torch.uint8, device=self.device) if ground is None else ground
+        flat = ("mosaic", "scroll") if config.moves else ()
+        self.drawn_names: tuple[str, ...] = (
+            "frames",
+            *flat,
+            *(("known", "place", "observed") if config.fog_px else ()),
+        )
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
     def to(self, device) -> FrameHistory:
         starts = StartClips(*(part.to(device) for part in vars(self.starts).values()))
-        return FrameHistory(self.config, starts, self.over.to(device))
+        return FrameHistory(self.config, starts, self.over.to(device), self.ground.to(device))
 
     def with_memory(self, recorded: Keyframes | None = None, budget_mb: float | None = None) -> FrameHistory:
         """The same: it has no keyframes."""
@@ -74,6 +91,8 @@ class FrameHistory:
         if len(set(self.config.moves)) > 1:  # with one move nothing ever scrolls, and the mosaic is the frame
             height, width = (times * length for times, length in zip(PICTURES, self.config.size))
             shows["mosaic"] = spaces.Box(0, 255, (height, width, 4), np.uint8)
+        if self.config.fog_px:
+            shows["known"] = spaces.Box(0, 1, self.config.size, np.float32)
         return Channels(shows, observes=("rgb",))
 
     # -- evidence -----------------------------------------------------------------------------------------------------
@@ -107,7 +126,19 @@ class FrameHistory:
             elif prior is None:
                 seen["mosaic"] = empty_mosaic(evidence.batch, self.config.size, self.device)
             seen["scroll"] = scroll_index(frames[:, 1], frames[:, 0], self.moves)
+        if self.config.fog_px:
+            shown = ~self.over.expand(len(frames), -1, -1)
+            place, share = locate(frames[:, 0], shown, self.ground)
+            seen["place"] = torch.where(share[:, None] >= ALIKE, place, self._followed(prior, seen["scroll"]))
+            seen["known"] = torch.full_like(frames[:, 0, 0], 255)
+            seen["observed"] = torch.ones(len(frames), dtype=torch.bool, device=self.device)
         return State(seen) if prior is None else prior.replace(**seen)
+
+    def _followed(self, prior: State | None, scroll: torch.Tensor) -> torch.Tensor:
+        """Where the newest picture lies on the ground, if it scrolled so, int64 [B, 2]; NOWHERE without a prior."""
+        if prior is None:
+            return torch.full((len(scroll), 2), NOWHERE, device=self.device)
+        return prior["place"] + self.moves[prior["scroll"]] - self.moves[scroll]
 
     # -- a step -------------------------------------------------------------------------------------------------------
 
@@ -129,18 +160,31 @@ class FrameHistory:
         if not self.config.moves:
             return Conditioning(glimpse_of_frames(frames), last, context, familiar)
         over = self.over.expand(len(frames), -1, -1)
-        return Conditioning(glimpse_of_frames(frames), last, context, familiar, self._joined(state), over)
+        joined, alone = self._joined(state), self.config.fog_px > 0
+        return Conditioning(glimpse_of_frames(frames), last, context, familiar, joined, over, evidence=alone)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
+        if self.config.fog_px and scroll is not None:
+            flat["place"] = state["place"] - self.moves[scroll]
+            flat["known"] = (conditioning.glimpse.known * 255).to(torch.uint8)
+            flat["observed"] = torch.zeros_like(state["observed"])
         return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:
         """The mosaic with the newest frame in its middle. A state's mosaic lags by a frame, which evidence may still replace. It
-        scrolls by the move that was drawn: new ground is often too plain to estimate the move from."""
-        return update_mosaic(state["mosaic"], state["frames"][:, 0], self.moves[state["scroll"]], self.over)
+        scrolls by the move that was drawn: new ground is often too plain to estimate the move from. With fog it takes observed
+        frames alone, and what it lacks from the ground."""
+        frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
+        whole = update_mosaic(state["mosaic"], frame, move, self.over)
+        if not self.config.fog_px:
+            return whole
+        unchanged = update_mosaic(state["mosaic"], frame, move, torch.ones_like(self.over))
+        whole = torch.where(state["observed"].view(-1, 1, 1, 1), whole, unchanged)
+        at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
+        return torch.where(whole[:, 3:] > 0, whole, window(self.ground, at, whole.shape[-2:]))
 
     def _whole(self, state: State) -> torch.Tensor:
         """The mosaic; where it is empty, what lies over it."""
@@ -151,7 +195,12 @@ class FrameHistory:
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         shown = {}
         if "rgb" in channels:
-            shown["rgb"] = newest_frame(state).permute(0, 2, 3, 1).contiguous()
+            frame = newest_frame(state)
+            if self.config.fog_px:
+                frame = fogged(frame, state["known"], state["mosaic"], self.config.fog_px)
+            shown["rgb"] = frame.permute(0, 2, 3, 1).contiguous()
+        if "known" in channels:
+            shown["known"] = state["known"].float() / 255
         if "mosaic" in channels:
             shown["mosaic"] = _shown(self._whole(state))
         return shown
@@ -161,6 +210,18 @@ def _shown(mosaic: torch.Tensor) -> torch.Tensor:
     """The channel `mosaic` (core/world.py) of mosaics uint8 [B, 4, H', W'] of colour and votes."""
     seen = (mosaic[:, 3:] > 0).to(torch.uint8) * 255
     return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
+
+
+def fogged(frame: torch.Tensor, known: torch.Tensor, mosaic: torch.Tensor, reach: int) -> torch.Tensor:
+    """Pictures uint8 [B, 3, H, W] whose unknown pixels (known uint8 [B, H, W] is 0) fade, within `reach` pixels of known ones, into
+    fog of the mean colour of the mosaic's seen pixels."""
+    seen = known[:, None].float() / 255
+    some = mosaic[..., ::4, ::4].float()
+    votes = (some[:, 3:] > 0).float()
+    colour = (some[:, :3] * votes).sum((2, 3), keepdim=True) / votes.sum((2, 3), keepdim=True).clamp_min(1)
+    near = F.avg_pool2d(seen, 2 * reach + 1, 1, reach, count_include_pad=False)
+    share = (1 - seen) * (1 - 2 * near).clamp(0, 1)
+    return torch.lerp(frame.float(), colour.expand_as(frame), share).round().to(torch.uint8)
 
 
 def glimpse_of_frames(frames: torch.Tensor) -> Glimpse:

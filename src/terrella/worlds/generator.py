@@ -28,7 +28,7 @@ class Conditioning:
     trust; where things move [B, 4 + PLANES, H, W] (carried_frames.py). context [B, n]: thumbnail of the last frame, in some
     worlds also the last actions. familiar [B, 2]: how well the place is known, for the uncertainty (keyframe_scene.py).
     Of a flat world: mosaic uint8 [B, 4, H', W'] (space/mosaic.py); over bool [B, H, W], what lies over it; scroll int64 [B], by
-    which of the codec's moves most of the picture goes on.
+    which of the codec's moves most of the picture goes on; evidence: whether the mosaic holds no invented pixels.
     """
 
     glimpse: Glimpse
@@ -38,6 +38,7 @@ class Conditioning:
     mosaic: torch.Tensor | None = None
     over: torch.Tensor | None = None
     scroll: torch.Tensor | None = None
+    evidence: bool = False
 
     def to(self, device) -> Conditioning:
         return self._each(lambda part: part.to(device))

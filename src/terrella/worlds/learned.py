@@ -107,7 +107,8 @@ class LearnedWorld:
         """The settings of all parts in one."""
         drawn, posed = self.generator.config, self.scene.camera is not None
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
-        settings.pop("moves", None)  # those of a codec, found in its recording
+        for name in ("moves", "fog_px"):  # of a codec, found in its recording
+            settings.pop(name, None)
         settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
         if self.body:
             settings |= {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from ...core import make_rng
+from ...core.state import State
 from ...worlds.codec import Codec
 from ...worlds.learned import LearnedWorld
 from ..recording import Recording
@@ -19,6 +20,17 @@ TOLERANCE = 0.115  # of the logarithm of errors, half a decibel: closer errors c
 CHANGED = 8  # difference of 255 from the step before above which a pixel has changed
 
 
+def observed(
+    world: LearnedWorld, recording: Recording, begins: np.ndarray, shown: int, chance: torch.Generator
+) -> State:
+    """The state of `world` that has observed `shown` rows from each of `begins` on, under the recorded actions."""
+    state = world.observe(recording.evidence(world.config, begins), None, chance)
+    for row in range(1, shown):
+        state = world.imagine(state, recording.recorded_actions(world.spec, begins + row - 1), chance)
+        state = world.observe(recording.evidence(world.config, begins + row), state, chance)
+    return state
+
+
 @torch.inference_mode()
 def choose_stress(world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int) -> float:
     """The power of POWERS with which rollouts of recorded episodes have the lowest error, by the mean logarithm of the pooled
@@ -31,11 +43,7 @@ def choose_stress(world: LearnedWorld, codec: Codec, recording: Recording, stres
     if not steps or stress < NEGLIGIBLE:
         return USUAL
     begins = rng.choice(np.flatnonzero(length >= SHOWN + steps), CLIPS, replace=False)
-    chance = make_rng(seed)
-    state = world.observe(recording.evidence(world.config, begins), None, chance)
-    for row in range(1, SHOWN):
-        state = world.imagine(state, recording.recorded_actions(world.spec, begins + row - 1), chance)
-        state = world.observe(recording.evidence(world.config, begins + row), state, chance)
+    state = observed(world, recording, begins, SHOWN, make_rng(seed))
     errors_of, change_off = [], []
     for power in POWERS:
         codec.stress.fill_(stress**power)

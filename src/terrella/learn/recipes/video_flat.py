@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from ..feeds import codec_feed, frames_feed
 from ..moves import CodecStatistics, frequent_moves, mosaics, overlay, palette
 from ..objectives.codec import CodecObjective, Spans
 from ..objectives.flow import Flow
+from ..objectives.fog import choose_fog
 from ..objectives.scroll import learn_scroll
 from ..objectives.stress import FRAMES, USUAL, choose_stress
 from ..objectives.uncertainty import dreaming_seconds
@@ -47,6 +49,8 @@ class CodecRecipe:
             raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
         self.objective = self._objective()
         self.starts: StartClips | None = None  # made once
+        self.ground: torch.Tensor | None = None  # chosen when the world is tuned
+        self.fog_px = 0
 
     def _objective(self) -> CodecObjective:
         """With the vocabulary of moves and colours of the recording, which the run's folder keeps."""
@@ -87,19 +91,23 @@ class CodecRecipe:
             rows = _start_rows(self.parts)
             self.starts = replace(self.starts, known=_mosaics_before(self.parts, rows, moves, over))
         whole = tuple((int(x), int(y)) for x, y in moves)
-        scene = FrameHistory(replace(self.video.frames, moves=whole), self.starts, over)
+        settings = replace(self.video.frames, moves=whole, fog_px=self.fog_px)
+        scene = FrameHistory(settings, self.starts, over, self.ground)
         return _flat_world(self.parts, trainer, self.objective, scene)
 
     def tuning_s(self, world: LearnedWorld) -> float:
-        return dreaming_seconds(world, self.parts.recording, FRAMES)
+        return 2 * dreaming_seconds(world, self.parts.recording, FRAMES)
 
     def tune(self, world: LearnedWorld) -> dict:
-        """How much the draw favours change is chosen by rollouts of recorded episodes."""
+        """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
+        recorded episodes."""
         objective = self.objective
         assert isinstance(world.generator, Codec)
         power = choose_stress(world, world.generator, self.parts.recording, objective.stress, self.parts.config.seed)
         objective.smooth.module.stress.copy_(world.generator.stress)
-        return {"taken_back": power}
+        scene = choose_fog(world, cast(FrameHistory, world.scene), self.parts.recording, self.parts.config.seed)
+        self.ground, self.fog_px = scene.ground, scene.config.fog_px
+        return {"taken_back": power, "fog_px": self.fog_px}
 
 
 class FlatFlowRecipe:
