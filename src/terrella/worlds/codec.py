@@ -146,8 +146,8 @@ class Codec(nn.Module):
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
-        """With `scroll`, the move by which most of the picture goes on, where there is a mosaic; and with what that mosaic then knows
-        of the picture, if it holds evidence alone."""
+        """With `scroll`, the move by which most of the picture goes on, where there is a mosaic; and with what that mosaic then
+        knows of the picture, if it holds evidence alone."""
         if conditioning.mosaic is None:
             return conditioning
         frames, context = _frames(conditioning), conditioning.context
