@@ -17,8 +17,8 @@ NOWHERE = -(10**6)  # x and y of a picture whose place is unknown
 
 def locate(pictures: torch.Tensor, shown: torch.Tensor, ground: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Where pictures uint8 [B, 3, h, w], of which the pixels `shown` bool [B, h, w] count, lie on the ground: x and y of their
-    upper left corners, int64 [B, 2], with the least squared error; and the share of pixels that are equal there [B], 0 where less than
-    half of the pixels would lie on the ground."""
+    upper left corners, int64 [B, 2], with the least squared error; and the share of pixels that are equal there [B], 0 where
+    less than half of the pixels would lie on the ground."""
     (height, width), (tall, wide) = pictures.shape[-2:], ground.shape[-2:]
     size = height + tall - 1, width + wide - 1
     seen, mask = (ground[3] > 0).float(), shown.float()
