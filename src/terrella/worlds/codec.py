@@ -154,7 +154,7 @@ class Codec(nn.Module):
         went = [edge_shares(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
         logits = self.scrolling(self.scrolling.frame_features(frames[:, 0]), context, torch.stack(went, 1))
         scroll = least_off(logits, self.moves)
-        if not conditioning.evidence:
+        if not conditioning.evidence or conditioning.over is None:
             return replace(conditioning, scroll=scroll)
         votes = read_mosaic(conditioning.mosaic, self.config.size, self.moves[scroll])[:, 3]
         known = ((votes > 0) | conditioning.over).float()

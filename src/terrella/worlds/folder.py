@@ -262,13 +262,11 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
         begun = replace(
             begun, actions=starts["actions"], vitals=starts["vitals"], known=starts.get("known", begun.known)
         )
-    ground = _below(remembered, "ground")
-    if ground:
-        size = 4, *ground["size"].tolist()
-        ground = torch.from_numpy(
-            np.frombuffer(zlib.decompress(ground["bytes"].numpy().tobytes()), np.uint8).reshape(size).copy()
-        )
-    return FrameHistory(config, begun, remembered.get("over"), ground if len(ground) else None)
+    packed, ground = _below(remembered, "ground"), None
+    if packed:
+        plane = np.frombuffer(zlib.decompress(packed["bytes"].numpy().tobytes()), np.uint8)
+        ground = torch.from_numpy(plane.reshape(4, *packed["size"].tolist()).copy())
+    return FrameHistory(config, begun, remembered.get("over"), ground)
 
 
 # By part and kind: its settings, and how it is made from them, its weights and the memory.

@@ -184,7 +184,7 @@ class FrameHistory:
         unchanged = update_mosaic(state["mosaic"], frame, move, torch.ones_like(self.over))
         whole = torch.where(state["observed"].view(-1, 1, 1, 1), whole, unchanged)
         at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
-        return torch.where(whole[:, 3:] > 0, whole, window(self.ground, at, whole.shape[-2:]))
+        return torch.where(whole[:, 3:] > 0, whole, window(self.ground, at, (whole.shape[2], whole.shape[3])))
 
     def _whole(self, state: State) -> torch.Tensor:
         """The mosaic; where it is empty, what lies over it."""
