@@ -187,6 +187,46 @@ def test_of_joints_that_follow_one_another_one_is_driven(tmp_path):
     assert world.spec.action_names == ("a", "b", "d")
 
 
+def link(name: str, mass: float, com: str, inertia: float) -> str:
+    about = " ".join(
+        f'{one}="{inertia if one[1] == one[2] else 0}"' for one in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    )
+    return (
+        f'<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="{com}"/><inertia {about}/></inertial></link>'
+    )
+
+
+def test_servos_of_a_long_arm_reach_what_is_asked_against_gravity(tmp_path):
+    """Six joints, light ones last: with Euler's method and the inertia alone they swing for ever."""
+    parts, axes = [link("l0", 3, "0 0 .1", 0.01)], ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+    for k, axis in enumerate(axes):
+        parts.append(link(f"l{k + 1}", 2.5 - 0.4 * k, "0 0 .12", 0.01 - 0.0015 * k))
+        parts.append(
+            f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/><origin xyz="0 0 .25"/>'
+            f'<axis xyz="{axis}"/><limit lower="-2.8" upper="2.8" effort="1000" velocity="2"/></joint>'
+        )
+    world = world_of(tmp_path, f"<robot name='arm'>{''.join(parts)}</robot>", "urdf")
+    wanted = [0.5, 0.8, -0.6, 0.3, 0.9, 0.0]
+    assert moved_by(world, wanted, 300) == pytest.approx(wanted, abs=0.05)
+
+
+def test_fingers_in_mirrored_chains_reach_what_is_asked_against_gravity(tmp_path):
+    text = "".join(link(name, 0.02, ".02 0 .03", 3e-5) for name in ("base", "l", "r", "lt", "rt"))
+    for name, parent, child, axis, mimic in (
+        ("a", "base", "l", "0 -1 0", ""),
+        ("b", "base", "r", "0 1 0", '<mimic joint="a"/>'),
+        ("c", "l", "lt", "0 -1 0", '<mimic joint="a" multiplier="-1"/>'),
+        ("d", "r", "rt", "0 1 0", '<mimic joint="b" multiplier="-1"/>'),
+    ):
+        text += (
+            f'<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/><origin xyz=".03 0 .05"/>'
+            f'<axis xyz="{axis}"/><limit lower="-.9" upper=".9" effort="20" velocity="2"/>{mimic}</joint>'
+        )
+    world = world_of(tmp_path, f"<robot name='hand'>{text}</robot>", "urdf")
+    end = moved_by(world, [0.5])  # in the order of the tree: a, c, b, d
+    assert world.spec.action_names == ("a",) and end == pytest.approx([0.5, -0.5, 0.5, -0.5], abs=0.02)
+
+
 @pytest.mark.skipif(not hasattr(mujoco.mjtGain, "mjGAIN_PID"), reason="this version of MuJoCo has no such actuators")
 def test_actuators_of_several_controls_are_refused(tmp_path):
     with pytest.raises(TerrellaError, match="several controls"):

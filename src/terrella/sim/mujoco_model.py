@@ -15,7 +15,9 @@ from mujoco import rollout as rollout
 
 from ..core.errors import TerrellaError
 
-SERVO_HZ, SERVO_DAMPING = 3.0, 1.0  # natural frequency and damping ratio of added servos
+SERVO_HZ, SERVO_DAMPING = 3.0, 1.0  # least natural frequency and damping ratio of added servos
+SERVO_SAG = {True: 0.001, False: 0.005}  # under the weight that a servo carries: slides in m, hinges in rad
+SERVO_STEPS = 0.3  # radians of a servo's swing in a physics step, at most
 FREE, BALL = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
 SLIDE = mujoco.mjtJoint.mjJNT_SLIDE
 
@@ -95,23 +97,44 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
 
 
 def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
-    """Adds a position servo to each hinge and slide that no other joint drives, with a stiffness for the inertia that it moves."""
+    """Adds a position servo to each hinge and slide that no other joint drives, with a stiffness for the inertia and weight that it
+    moves. Euler's method, with which damping makes light joints of long chains unstable, is replaced."""
+    if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     groups = coupled_joints(model)
     driven = {joint for group in groups for joint in list(group)[1:]} | set(_held_joints(model, groups))
     moves = {next(iter(group)): group for group in groups}
+    inertias, weights = model.dof_M0[model.jnt_dofadr], _weights(model)
+    loose = 1 / np.maximum(model.dof_invweight0[model.jnt_dofadr], 1e-9)  # inertias while all other joints are loose
     for joint in spec.joints:
         at = model.joint(joint.name).id if joint.type not in (FREE, BALL) else -1
         if at < 0 or at in driven:
             continue
-        inertias = model.dof_M0[model.jnt_dofadr]
-        inertia = sum(ratio**2 * float(inertias[one]) for one, (ratio, _) in moves.get(at, {at: (1.0, 0.0)}).items())
-        inertia = max(inertia, 1e-6)
-        stiff = inertia * (2 * np.pi * SERVO_HZ) ** 2
+        ratios = {one: abs(ratio) for one, (ratio, _) in moves.get(at, {at: (1.0, 0.0)}).items()}
+        inertia = max(sum(ratio**2 * float(inertias[one]) for one, ratio in ratios.items()), 1e-6)
+        weight = sum(ratio * weights[one] for one, ratio in ratios.items())
+        firm = min(weight / SERVO_SAG[joint.type == SLIDE], float(loose[at]) * (SERVO_STEPS / model.opt.timestep) ** 2)
+        stiff = max(inertia * (2 * np.pi * SERVO_HZ) ** 2, firm)
         servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_position(stiff, kv=2 * SERVO_DAMPING * float(np.sqrt(stiff * inertia)))
         servo.ctrllimited = bool(model.jnt_limited[at])
         if servo.ctrllimited:
             servo.ctrlrange = model.jnt_range[at]
+
+
+def _weights(model: mujoco.MjModel) -> list[float]:
+    """The largest force or torque with which gravity pulls each joint around the reference pose, N or N m; 0 across gravity."""
+    data, weights = mujoco.MjData(model), []
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    for at, body in enumerate(model.jnt_bodyid):
+        pull, axis = model.body_subtreemass[body] * model.opt.gravity, data.xaxis[at]
+        arm = np.cross(axis, data.subtree_com[body] - data.xanchor[at])
+        slides = model.jnt_type[at] == int(SLIDE)
+        weights.append(
+            float(abs(pull @ axis) if slides else np.linalg.norm(arm) * np.linalg.norm(np.cross(axis, pull)))
+        )
+    return weights
 
 
 def coupled_joints(model: mujoco.MjModel) -> list[dict[int, tuple[float, float]]]:
