@@ -80,6 +80,7 @@ def drawn(picture) -> np.ndarray:
         RGB.transpose(2, 0, 1),
         np.dstack([RGB, GREY]).transpose(2, 0, 1) / 255,
         RGB.astype(np.uint16) * 257,
+        RGB.astype(np.int32) * 256,
         RGB.astype(np.int64),
         RGB.astype(np.float64),
         RGB[None],

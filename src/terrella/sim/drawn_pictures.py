@@ -32,7 +32,9 @@ class DrawnPictures:
         array, what = _array(value)
         array = _colours(array, what)
         self._white = max(self._white, _white(array))
-        if array.dtype != np.uint8 or self._white != 255:
+        if array.dtype.kind in "iu" and array.dtype != np.uint8 and self._white > 255:
+            array = (np.clip(array, 0, 65535) // 256).astype(np.uint8)  # the high byte, as 16-bit pictures are read
+        elif array.dtype != np.uint8:
             bright = np.nan_to_num(np.asarray(array, np.float64)) / self._white
             array = (np.clip(bright, 0, 1) * 255).round().astype(np.uint8)
         self.form = self.form or f"drawn as {what} up to {self._white:g}"
