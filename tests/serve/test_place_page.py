@@ -14,7 +14,7 @@ import torch
 from terrella.cli import main
 from terrella.library import load
 from terrella.serve.http_server import make_server, open_port
-from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundle_script
+from terrella.serve.place_page import PAGE, EditablePlace, PlacePage, build_place, bundle_script, spread_over
 from terrella.space.camera import planar_pose
 from terrella.space.edits import apply_edits
 from terrella.space.occupancy import Occupancy, Walker
@@ -224,6 +224,16 @@ def test_known_walls_are_met_as_in_python(tmp_path, opened):
     theirs = torch.tensor(page.evaluate(MOVED, [points.tolist(), wish.tolist()]))
     mine = torch.cat([walled.collider.walk(points, wish, body), walled.collider.floor(points, body)[:, None]], 1)
     assert ((theirs - mine).abs().amax(1) < 0.01).float().mean() > 0.98
+
+
+def test_what_is_shown_first_lies_on_all_surfaces():
+    place = world(6000).gaussians
+    first = spread_over(place, 700)
+    off = torch.cdist(place.means, place.means[first]).amin(1)
+    chance = torch.cdist(
+        place.means, place.means[torch.randperm(6000, generator=torch.Generator().manual_seed(0))[:700]]
+    )
+    assert int(first.sum()) == 700 and off.max() < 0.8 * chance.amin(1).max()
 
 
 def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser, monkeypatch):

@@ -124,13 +124,30 @@ def _packed_whole(place: PlaceScene) -> tuple[dict[str, Any], str]:
 
 def packed_place(place: PlaceScene, first: int) -> tuple[dict[str, Any], bytes, bytes]:
     """A place as scene.js and solid.js unpack it: a description with `count`, `first` and `solid`; in gzip, what is solid and the
-    columns of `first` Gaussians, spread evenly; and in gzip the columns of the rest, empty if there is none."""
+    columns of `first` Gaussians, spread over all surfaces; and in gzip the columns of the rest, empty if there is none."""
     count, (solid, cubes) = len(place.gaussians), _packed_solid(place.collider)
-    chosen = torch.zeros(count, dtype=torch.bool)
-    chosen[torch.arange(first) * count // max(first, 1)] = True
+    chosen = spread_over(place.gaussians, first)
     parts = [cubes + _packed(place, chosen), _packed(place, ~chosen) if first < count else b""]
     early, late = (gzip.compress(part, 6, mtime=0) if part else b"" for part in parts)
     return {"count": count, "first": first, "solid": solid}, early, late
+
+
+def spread_over(gaussians: Gaussians, many: int) -> torch.Tensor:
+    """`many` of the Gaussians, bool [N]: one in each cube of the finest grid that has no more cubes than that, then others."""
+    chosen, left = torch.zeros(len(gaussians), dtype=torch.bool), gaussians.opacities > 0
+    if many >= len(gaussians):
+        return ~chosen
+    for cell in 20.0 / 2.0 ** torch.arange(12):
+        cubes = (gaussians.means[left] / cell).floor().long() & 0xFFFFF
+        _, one = np.unique(cubes @ torch.tensor([1 << 40, 1 << 20, 1]), return_index=True)
+        if len(one) > many:
+            break
+        chosen[:] = False
+        chosen[left.nonzero()[one, 0]] = True
+    others = (~chosen).nonzero()[:, 0]
+    more = many - int(chosen.sum())
+    chosen[others[torch.arange(more) * len(others) // max(more, 1)]] = True
+    return chosen
 
 
 def bundle_script(path: Path) -> str:
