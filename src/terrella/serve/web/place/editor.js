@@ -34,7 +34,7 @@ export class Editor {
     $('redo').onclick = () => this.change(() => story.redo());
     $('save').onclick = () => this.save();
     $('open').onchange = () => this.read($('open').files[0]);
-    this.take('sphere');
+    this.take(story.scene.objects.some((number) => number > 0) ? 'object' : 'sphere');
     this.show();
   }
 
