@@ -61,7 +61,7 @@ def import_(
         file: The file; for an unpacked .sog its folder.
         out: Folder of the world.
     """
-    show(import_space(file, out, config, progress=say), json)
+    show(import_space(file, out, config), json)
 
 
 def export(

@@ -83,24 +83,24 @@ def _watched(port: int, progress: Progress) -> Iterator[Watch]:
         yield lambda make, facts: show(lambda: page_scene(make()), facts)
 
 
-def import_space(file: Path, out: Path, config: ImportSpaceConfig, *, progress: Progress = silent) -> SpaceResult:
+def import_space(file: Path, out: Path, config: ImportSpaceConfig) -> SpaceResult:
     """Makes a world of a file of Gaussians, or of the triangles of a .glb or .gltf."""
     if not 0 < config.scale < float("inf") or not _is_size(config.size):
         raise TerrellaError("--scale is above 0, and --size from 8 to 4096 pixels a side.")
-    if file.suffix.lower() in GLTF_ENDINGS and config.axes is None:
-        scene = read_gltf(file, config.scale)
-        if isinstance(scene, GltfScene):
-            return _of_triangles(scene, file, out, BuildSpaceConfig.gaussians, config.size)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        gaussians = read_scene(file, config.axes)
-    for warning in caught:
-        progress(f"{file}: {warning.message}")
+        is_gltf = file.suffix.lower() in GLTF_ENDINGS and config.axes is None
+        scene = read_gltf(file, config.scale) if is_gltf else None
+        if not isinstance(scene, GltfScene):
+            scene = read_scene(file, config.axes)
+    if isinstance(scene, GltfScene):
+        return _of_triangles(scene, file, out, BuildSpaceConfig.gaussians, config.size)
     if config.scale != 1:
-        gaussians = transform(gaussians, torch.eye(3), config.scale)
-    save_splat(world_of(gaussians, file.stem, {"file": file.name}, _splat_config(config.size)), out)
-    facts = {"gaussians": len(gaussians), "world": str(out)}
-    return SpaceResult(facts, (f"{len(gaussians):,} Gaussians; terrella play {out}",))
+        scene = transform(scene, torch.eye(3), config.scale)
+    left_out = list(dict.fromkeys(str(warning.message) for warning in caught))
+    save_splat(world_of(scene, file.stem, {"file": file.name}, _splat_config(config.size)), out)
+    facts = {"gaussians": len(scene), "world": str(out), "left_out": left_out}
+    return SpaceResult(facts, (f"{len(scene):,} Gaussians; terrella play {out}", *left_out))
 
 
 def build_space(source: str | Path | None, out: Path, config: BuildSpaceConfig) -> SpaceResult:
