@@ -132,6 +132,21 @@ def test_infos_of_later_episodes_are_read(tmp_path):
     assert sum("info.wrist" in note or "info.grip" in note for note in notes) == 2
 
 
+def test_minari_gets_what_all_episodes_have(tmp_path):
+    npz(tmp_path / "a", "actions grip", "actions front")
+    notes = write_source(open_source(tmp_path / "a", fps=10), tmp_path / "b-v0", "minari")
+    source = open_source(tmp_path / "b-v0")
+    assert {"observation.state", "action"} <= set(source.sensors) and len(list(source.takes())) == 2
+    for name in ("observation.grip", RGB):
+        assert name not in source.sensors and any(
+            f"'{name}' was left out: some take lacks it" in note for note in notes
+        )
+    npz(tmp_path / "c", "actions", "front")
+    with pytest.raises(DatasetError, match="take 1 lacks 'action'"):
+        write_source(open_source(tmp_path / "c", fps=10), tmp_path / "d-v0", "minari")
+    assert not (tmp_path / "d-v0").exists()
+
+
 def test_folders_of_pictures_may_have_other_cameras(tmp_path):
     for place in ("0/front", "0/top", "1/top", "1/side"):
         (tmp_path / "a" / place).mkdir(parents=True)

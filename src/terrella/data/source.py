@@ -5,8 +5,8 @@ A `Source` is a recording in any format: its sensors and its takes. A `Take` is 
 between. Values are decoded when they are read, so a Source may be larger than memory.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -79,6 +79,17 @@ class Source:
     robot: str = ""  # type of the robot ("terrella", "aloha", …), "" where unknown
     notes: tuple[str, ...] = ()  # sentences about parts of the original that could not be converted
     facts: Mapping[str, object] = field(default_factory=dict)  # JSON values stored with the recording
+
+
+def without(source: Source, names: Collection[str]) -> Source:
+    """The source without some of its sensors."""
+
+    def takes() -> Iterator[Take]:
+        for take in source.takes():
+            yield replace(take, readings={name: it for name, it in take.readings.items() if name not in names})
+
+    sensors = {name: sensor for name, sensor in source.sensors.items() if name not in names}
+    return replace(source, sensors=sensors, takes=takes) if names else source
 
 
 def is_action(name: str) -> bool:

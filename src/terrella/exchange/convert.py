@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from ..core.errors import DatasetError
 from ..data.format import INFO, some_of
-from ..data.source import Sensor, Source, Take
+from ..data.source import Sensor, Source, Take, without
 from .formats.folders import IMAGES, VIDEOS
 from .formats.rows import facts_of
 
@@ -165,13 +165,7 @@ def write_source(
 def _without_text(source: Source, notes: dict[str, None], kind: _Kind) -> Source:
     texts = [name for name, sensor in source.sensors.items() if sensor.dtype == "string"]
     notes |= {f"'{name}' is text, which {kind.name} has no place for, and was left out.": None for name in texts}
-    sensors = {name: sensor for name, sensor in source.sensors.items() if name not in texts}
-
-    def takes() -> Iterator[Take]:
-        for take in source.takes():
-            yield replace(take, readings={name: it for name, it in take.readings.items() if name not in texts})
-
-    return replace(source, sensors=sensors, takes=takes) if texts else source
+    return without(source, texts)
 
 
 def _absences(source: Source, seen: dict[str, list[int]], then: str) -> Iterator[str]:

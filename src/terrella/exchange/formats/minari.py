@@ -13,7 +13,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...core.files import creating
-from ...data.source import Sensor, Source, Take
+from ...data.source import Sensor, Source, Take, without
 from . import arrays, rows, spaces
 from .arrays import Place
 from .minari_stored import Shapes, StoredEpisode, open_storage
@@ -120,19 +120,39 @@ def _fits(array: arrays.Array | None, sensor: Sensor) -> bool:
     return array is not None and array.is_numeric and array.shape[1:] == rows.stored_shape(sensor)
 
 
+class _Lacking(DatasetError):
+    """A take has no reading of the sensor `name`, which Minari needs in every episode."""
+
+    def __init__(self, where: str, name: str):
+        super().__init__(f"{where} lacks '{name}', which Minari needs in every episode; write another format.")
+        self.name = name
+
+
 def write(source: Source, path: str | Path, progress: Callable[[int, int], None] | None = None) -> list[str]:
     """Writes a source as a Minari dataset (HDF5, lossless pictures); returns a note on everything that was left out.
 
     With MINARI_DATASETS_PATH set to the parent of `path`, `minari.load_dataset(path.name)` opens it. The name must end in
     -v0, -v1, …. Spaces are facts["observation_space"] and facts["action_space"] if their leaves match the sensors, else a
-    Dict with a Box per sensor. Minari needs an observation after the last action: where a take has none, its last action is
-    left out. Missing rewards become 0; a missing end becomes a truncation at the last step. Names, units, frames and fps are
-    kept in the metadata. `progress(takes, 0)` is called after each take. DatasetError where a take does not fit or `path`
-    exists.
+    Dict with a Box per sensor. Observations and actions that some take lacks are left out, all but the last of a role.
+    Minari needs an observation after the last action: where a take has none, its last action is left out. Missing rewards
+    become 0; a missing end becomes a truncation at the last step. Names, units, frames and fps are kept in the metadata.
+    `progress(takes, 0)` is called after each take. DatasetError where a take does not fit or `path` exists.
     """
+    notes: list[str] = []
+    while True:
+        try:
+            return [*notes, *_written(source, Path(path), progress)]
+        except _Lacking as error:
+            role = rows.role_of(error.name)
+            if sum(rows.role_of(name) == role for name in source.sensors) < 2:
+                raise
+            source = without(source, (error.name,))
+            notes.append(f"'{error.name}' was left out: some take lacks it, and Minari needs it in every episode.")
+
+
+def _written(source: Source, path: Path, progress: Callable[[int, int], None] | None) -> list[str]:
     from . import hdf5_file
 
-    path = Path(path)
     if not _ID.fullmatch(path.name):
         raise DatasetError(f"'{path.name}' is no Minari id: name the folder like name-v0.")
     notes: dict[str, None] = {}
@@ -223,7 +243,7 @@ def _write_take(group, number: int, source: Source, take: Take, places: Mapping,
     where = f"take {number}"
     missing = [name for place, name in places.items() if place[0] in _ROLES and name not in (None, *take.readings)]
     if missing:
-        raise DatasetError(f"{where} lacks '{missing[0]}', which Minari needs in every episode; leave it out.")
+        raise _Lacking(where, str(missing[0]))
     named = [name for place, name in places.items() if name is not None and place[0] != "infos"]
     counts = rows.rows_of(replace(take, readings={n: take.readings[n] for n in named if n in take.readings}), where)
     steps = min(counts.steps, counts.observations - 1)
