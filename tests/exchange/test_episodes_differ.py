@@ -103,6 +103,15 @@ def test_padding_is_known_to_the_doctor_and_left_out_of_training(tmp_path):
     recording = Recording.open(data, (16, 24), lambda *given: None)
     first, stop = recording.cache.episodes[1]
     assert not recording.usable[first:stop].any() and recording.usable.any()
+    few = recording.having(("grip",))
+    assert [bool(few.usable[slice(*part)].any()) for part in few.cache.episodes] == [
+        False,
+        False,
+        *few.usable[[18, 27]],
+    ]
+    assert few.usable.any() and len(few.held_out) == 1 and few.held_out[0] in (2, 3)
+    with pytest.raises(DatasetError, match="no episode has readings of all of"):
+        Clips(data, ClipsConfig(4, ("rgb", "grip", "action"), 1, (16, 24), episodes=[0, 1, 3]))
     remote = Clips(f"file://{tmp_path / 'set'}", ClipsConfig(4, ("rgb", "grip"), 1, (16, 24), cache_dir=tmp_path / "c"))
     assert remote.padded == (0, 1) and len(list(remote)) == 12
 

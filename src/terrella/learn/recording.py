@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,10 +63,10 @@ class Recording:
             raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
         if keep_out is not None and not has_channel(cache, "pose"):
             raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
-        whole = set(episodes_with(needs, np.arange(len(cache.episodes)), cache.absent).tolist())
-        train, held_out = ([number for number in part if number in whole] for part in split(len(cache.episodes)))
+        train, held_out = split(len(cache.episodes))
         recording = Recording.of(cache, train, keep_out)
-        return replace(recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+        recording = replace(recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+        return recording.having(needs)
 
     @staticmethod
     def of(cache: ClipCache, episodes: list[int], keep_out: Box | None) -> Recording:
@@ -75,6 +76,19 @@ class Recording:
             start[first:last] = first
         fx, fy, cx, cy = cache.world.get("camera") or (1.0, 1.0, 0.5, 0.5)
         return Recording(cache, start, usable_rows(cache, episodes, keep_out, (fx, fy, cx, cy)))
+
+    def having(self, channels: Iterable[str]) -> Recording:
+        """The recording without the episodes that have no reading of one of the channels: their rows of it are padding."""
+        cache = self.cache
+        names = [cache.keys.get(name, name) for name in channels]
+        whole = set(episodes_with(names, np.arange(len(cache.episodes)), cache.absent).tolist())
+        held_out = tuple(number for number in self.held_out if number in whole)
+        if self.held_out and not held_out and len(whole) > 1:
+            held_out = (max(whole),)
+        usable = self.usable.copy()
+        for number, (first, stop) in enumerate(cache.episodes):
+            usable[first:stop] &= number in whole and number not in held_out
+        return replace(self, usable=usable, held_out=held_out)
 
     def require_rows(self) -> Recording:
         """The recording itself; DatasetError if it has too few rows to train on."""

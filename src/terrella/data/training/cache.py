@@ -274,9 +274,12 @@ def absent_of(dataset: Dataset) -> dict[str, list[int]]:
 
 
 def episodes_with(channels: Iterable[str], numbers: np.ndarray, absent: Mapping[str, Sequence[int]]) -> np.ndarray:
-    """Those of the episodes `numbers` that have readings of all `channels`, names of arrays."""
-    lacking = {number for name in channels for number in absent.get(name, ())}
-    return numbers[~np.isin(numbers, sorted(lacking))]
+    """Those of the episodes `numbers` that have readings of all `channels`, names of arrays; DatasetError where none has."""
+    lacking = {name: absent[name] for name in channels if name in absent}
+    whole = numbers[~np.isin(numbers, sorted({number for part in lacking.values() for number in part}))]
+    if len(numbers) and not len(whole):
+        raise DatasetError(f"no episode has readings of all of {', '.join(lacking)}; choose fewer channels.")
+    return whole
 
 
 def kinds_of(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str] = ()) -> Kinds:

@@ -145,6 +145,8 @@ class _Training:
         self.controls = recording.controls
         self.sees_pictures = recording.cache.rgb is not None and config.pictures
         shape = self._shape()
+        seen = [name for name, _ in shape.vectors] + ["rgb"] * self.sees_pictures
+        self.recording = recording = recording.having(seen)
         self.network = LatentNetwork(shape).to(run.device)
         arrays = [self._array(name) for name, _ in shape.vectors]
         rows = np.flatnonzero(recording.usable)
