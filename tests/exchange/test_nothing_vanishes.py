@@ -280,6 +280,20 @@ def test_the_doctor_names_what_is_no_part_of_a_recording(tmp_path, capsys):
     assert here == {"front", "state"} and named >= {"force", "wrist", "yaml"}
 
 
+def test_space_import_names_what_no_place_holds(tmp_path, capsys):
+    names = ("x", "y", "z", "nx", "label", "confidence")
+    header = ["ply", "format ascii 1.0", "element vertex 40", *(f"property float {name}" for name in names)]
+    header += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header += ["element face 1", "property list uchar int vertex_indices", "end_header"]
+    points = [f"{k} {k % 7} {k % 5} 0 3 0.5 200 100 50" for k in range(39)] + ["nan 0 0 0 3 0.5 1 2 3", "3 0 1 2"]
+    (tmp_path / "a.ply").write_text("\n".join([*header, *points]) + "\n")
+    assert main(["space", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "place")]) == 0
+    said = "".join(capsys.readouterr())
+    assert "39 Gaussians" in said, "what came out is counted"
+    for word in ("nx", "label", "confidence", "1 face", "1 of its 40"):
+        assert word in said, word
+
+
 def test_record_gives_or_names_every_part_of_an_observation(tmp_path, capsys):
     world, _ = environment(tmp_path)
     assert main(["record", "world", world, "--frames", "30", "--out", str(tmp_path / "set")]) == 0

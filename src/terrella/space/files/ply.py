@@ -15,6 +15,7 @@ _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
+_COLUMN = re.compile(r"[xyz]|(diffuse_)?(red|green|blue)|[rgb]|alpha|opacity|(f_dc|f_rest|scale|rot)_\d+")
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
@@ -31,6 +32,16 @@ def other_elements(data: bytes) -> list[str]:
     """Elements of a PLY beside points and what belongs to Gaussians, such as the faces of a mesh, with their numbers."""
     return [
         f"{count:,} {name}s" for name, count, _ in _header(data)[1] if count and name not in ("vertex", "chunk", "sh")
+    ]
+
+
+def other_columns(rows: np.ndarray) -> list[str]:
+    """Columns of the element `vertex` that no Gaussian is made of, such as labels; of Gaussians the normals, always 0, are none."""
+    names = rows.dtype.names or ()
+    return [
+        name
+        for name in names
+        if not _COLUMN.fullmatch(name) and not ("scale_0" in names and name in ("nx", "ny", "nz"))
     ]
 
 
@@ -89,7 +100,8 @@ def decode(elements: dict[str, np.ndarray]) -> Gaussians:
         colours = _colours(rows)
         solid = shares(rows, "alpha")[:, 0] if "alpha" in (rows.dtype.names or ()) else torch.ones(len(rows))
         solid = solid if solid.any() else torch.ones(len(rows))  # some tools leave it 0
-        spread = (means.amax(0) - means.amin(0)).norm() / max(len(rows), 1) ** 0.5
+        finite = means[means.isfinite().all(1)] if means.isfinite().all(1).any() else torch.zeros(1, 3)
+        spread = (finite.amax(0) - finite.amin(0)).norm() / max(len(rows), 1) ** 0.5
         scales = torch.full((len(rows), 3), float(spread) * 0.4)
         quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(rows), 1)
         return Gaussians(means, quats, scales, 0.9 * solid, plain_sh(colours))
