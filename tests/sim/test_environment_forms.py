@@ -121,6 +121,12 @@ def test_a_bilevel_picture_is_black_and_white_and_a_dark_one_stays_dark():
     assert world.render(state, ("rgb",))["rgb"].unique().tolist() == [1], "1 of 255, as the picture before says"
 
 
+def test_a_highlight_beyond_white_darkens_nothing():
+    bright = RGB / 255
+    bright[0, 0] = 1.7
+    assert (drawn(bright)[0, 0] == 255).all() and (drawn(bright)[1:] == RGB[1:]).all()
+
+
 @pytest.mark.parametrize("picture", [None, "ascii", np.zeros(7), np.zeros((24, 32, 9)), [], (None,), {}])
 def test_what_is_no_picture_is_named(picture):
     world = GymnasiumWorld(gives(render=picture))

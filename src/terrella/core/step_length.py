@@ -20,28 +20,15 @@ _SIMULATORS = ("data.time", "sim.data.time", "physics.data.time", "_env.physics.
 _CLOCKS = ("time", "sim_time", "simulation_time", "_time")
 # By name the rate, or the length, of a step of the environment.
 _RATES = (
-    "control_freq",
-    "control_frequency",
-    "control_hz",
-    "control_rate",
-    "ctrl_freq",
-    "policy_freq",
-    "policy_frequency",
-)
+    "control_freq", "control_frequency", "control_hz", "control_rate", "ctrl_freq", "policy_freq", "policy_frequency",
+)  # fmt: skip
 _PERIODS = ("control_timestep", "control_dt", "ctrl_timestep", "ctrl_dt", "step_dt")
 # The length of a step of the environment or of its physics; of its physics alone; and how many of these a step has.
 _STEPS = ("dt", "tau", "timestep", "time_step")
 _PHYSICS = ("physics_dt", "sim_dt", "sim_timestep", "physics_timestep", "model.opt.timestep", "sim.model.opt.timestep")
 _COUNTS = (
-    "frame_skip",
-    "frameskip",
-    "n_substeps",
-    "num_substeps",
-    "substeps",
-    "sim_steps",
-    "decimation",
-    "action_repeat",
-)
+    "frame_skip", "frameskip", "n_substeps", "num_substeps", "substeps", "sim_steps", "decimation", "action_repeat",
+)  # fmt: skip
 _FRAMES = ("render_fps", "video.frames_per_second")
 _UNIT = re.compile(r"\s*(fps|hz)\s*$", re.IGNORECASE)
 _TRIAL_STEPS, _LONGEST_S = 3, 60.0
@@ -103,13 +90,12 @@ def _stepped(env: gymnasium.Env, frame: dict[str, float]) -> dict[str, float]:
     frame_s = next(iter(frame.values()), None)
     lengths: dict[str, float] = {}
     for name, length in {**steps, **physics}.items():
-        whole = f"{name} x {count_name}", length * count
-        computed = isinstance(
-            getattr(type(env.unwrapped), name, None), property
-        )  # as MujocoEnv.dt, which counts its substeps
-        if count == 1 or (name in steps and (computed or _nearer(length, length * count, frame_s))):
-            whole = name, length
-        lengths[whole[0]] = whole[1]
+        computed = isinstance(getattr(type(env.unwrapped), name, None), property)  # as MujocoEnv.dt: it counts them
+        counted = name in steps and (computed or _nearer(length, length * count, frame_s))
+        if count == 1 or counted:
+            lengths[name] = length
+        else:
+            lengths[f"{name} x {count_name}"] = length * count
     if count > 1 or frame_s is None or not lengths:
         return lengths
     name, length = next(iter(lengths.items()))

@@ -8,6 +8,7 @@ from PIL import Image
 
 from ..core.errors import TerrellaError
 
+MOST_OVERSHOOT = 16.0  # of the highlights in pictures of floats up to 1
 _PICTURE_KEYS = ("rgb", "image", "pixels", "frame")
 _MODES = ("1", "L", "LA", "RGB", "RGBA", "I", "I;16", "F")  # of PIL images that are arrays of brightness as they are
 
@@ -16,9 +17,9 @@ class DrawnPictures:
     """Reads what `render()` returns. The range of its numbers is that of the brightest picture so far.
 
     An array, tensor, PIL image or nested list of [H, W], [H, W, C] or [C, H, W], where C is 1 (grey), 2 (grey and alpha), 3 or 4
-    (alpha, or depth, which is left out). Integers are up to 255, or to 65535 where one is above 255; floats up to 1, else up to
-    255. Of a list of pictures the last counts, of a tuple and of a mapping the first picture with colours. `form` describes
-    the first picture where it is none of uint8 [H, W, 3]. TerrellaError for anything else.
+    (alpha, or depth, which is left out). Integers are up to 255, or to 65535 where one is above 255; floats up to 1, or to 255
+    where one is far above 1. Of a list of pictures the last counts, of a tuple and of a mapping the first with colours. `form`
+    describes the first picture where it is none of uint8 [H, W, 3]. TerrellaError for anything else.
     """
 
     def __init__(self):
@@ -46,8 +47,8 @@ def _array(value: Any) -> tuple[np.ndarray, str]:
     if isinstance(value, Mapping):
         keys = [key for key in _PICTURE_KEYS if key in value] or list(value)
         return _first([value[key] for key in keys], f"a dictionary of {', '.join(map(str, value))}")
-    if isinstance(value, tuple) and value and all(_is_picture(one) for one in value):
-        return _first(value, f"a tuple of {len(value)}")
+    if isinstance(value, tuple) and (pictures := [one for one in value if _is_picture(one)]):
+        return _first(pictures, f"a tuple of {len(value)}")
     if isinstance(value, list) and value and _is_picture(value[-1]):
         return _array(value[-1])[0], f"a list of {type(value[-1]).__name__}"
     if isinstance(value, Image.Image):
@@ -96,6 +97,6 @@ def _white(array: np.ndarray) -> float:
     if array.dtype == bool:
         return 1.0
     top = float(np.nan_to_num(array, posinf=0.0).max())
-    if array.dtype.kind == "f" and not top > 1:
+    if array.dtype.kind == "f" and top <= MOST_OVERSHOOT:
         return 1.0
     return 255.0 if not top > 255 else 65535.0
