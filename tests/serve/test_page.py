@@ -170,6 +170,7 @@ def test_recording_and_a_clip(serve_world, open_page):
     until(page, f"terrella.step > {step + 10}")
     page.click("#record")
     until(page, "!terrella.recording")
+    until(page, "document.getElementById('toast').textContent.startsWith('Saved')")
     assert server.sinks[0].closed and len(server.sinks[0].rows) >= 8 and server.sinks[0].ends == 1
     with page.expect_download() as download:
         page.click("#clip")

@@ -1,7 +1,5 @@
 """The command `terrella play`: a world, or a game and a world side by side, on a page in the browser."""
 
-import shlex
-import sys
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -32,7 +30,7 @@ def play(
     Args:
         name: A name of `terrella list`, the path of a checkpoint or run, or an environment (gym:ID).
     """
-    page = ServeConfig(host, port, token, seed, command=shlex.join(["terrella", *sys.argv[1:]]))
+    page = ServeConfig(host, port, token, seed)
 
     def begun(address: str) -> None:
         result({"address": address}, json, f"Choose a world: open {address}")

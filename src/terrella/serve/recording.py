@@ -30,6 +30,8 @@ class SessionRecording:
 
     def __init__(self, factory: SinkFactory | None):
         self.fault = ""
+        self.saved = ""  # what was saved when it was last closed, in a sentence
+        self._rows = self._episodes = 0
         self._factory = factory
         self._sink: Sink | None = None
         self._seen: dict[str, np.ndarray] | None = None  # the observation that the next action answers
@@ -44,6 +46,7 @@ class SessionRecording:
             if self._factory is None:
                 raise ServeError("there is no folder to record to; start the server with --record FOLDER.")
             self._sink, self._seen, self.fault = self._factory(), None, ""
+            self._rows = self._episodes = 0
 
     def add(self, seen: Mapping[str, torch.Tensor], action: torch.Tensor | None, reward: float, done: bool) -> None:
         """The observation [1, ...] of this moment, and the action [1, ...] that led to it (None at an episode's start)."""
@@ -54,16 +57,22 @@ class SessionRecording:
         if before is not None and action is not None:
             taken = action[0].cpu().numpy()
             self._try(lambda sink: sink.add(before, taken, reward, done))
+            self._rows += 1
 
     def end_episode(self) -> None:
         last, self._seen = self._seen, None
         if last is not None:
             self._try(lambda sink: sink.add(last, None, 0.0, None))
             self._try(lambda sink: sink.end_episode())
+            self._episodes += 1
 
     def close(self) -> None:
+        on = self.on
         self.end_episode()
         self._try(lambda sink: sink.close())
+        if on and self.on:
+            several = "s" * (self._episodes != 1)
+            self.saved = f"saved {self._rows:,} steps in {self._episodes} episode{several}."
         self._sink = None
 
     def _try(self, do: Callable[[Sink], object]) -> None:

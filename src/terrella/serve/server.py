@@ -50,7 +50,7 @@ class ServeConfig:
     faults: int = 20  # malformed messages after which its socket is closed
     history_s: float = 30.0  # seconds of pictures that are kept, for rewinding and clips
     state_mb: int = 256  # memory for the states among them, in MiB
-    command: str = ""  # what starts this server again, for pages that have lost it
+    record_in: str = ""  # where `sink_factory` records, in words
     home: bool = False  # whether there is a start page, to which the page links
 
 
@@ -130,7 +130,8 @@ class Sessions:
                 for world, label in zip(self.worlds, labels, strict=True)
             ],
             no_rewind=no_rewind(self.worlds),
-            command=self.config.command or starting_command(),
+            command=starting_command(),
+            record_in=self.config.record_in,
             home=self.config.home,
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             agent=self._agents is not None,

@@ -246,9 +246,10 @@ class Timeline:
             self.close()
 
     def close(self) -> None:
-        """Ends the recording."""
+        """Ends the recording, and says what was saved."""
+        on = self.recording.on
         self.recording.close()
-        self.notice = self.recording.fault or self.notice
+        self.notice = self.recording.fault or (self.recording.saved if on else self.notice)
 
     # -- inside -------------------------------------------------------------------------------------------------
 

@@ -93,6 +93,7 @@ def prepared(
         "policy": _driver(worlds, config), "picture": picture, "sink_factory": _sink(worlds[0], keeper, config.record),
         "keep": keeper, "kept_in": keeper.place,
     }  # fmt: skip
+    page = replace(page, record_in=str(config.record or ""))
     if page.seed is None:
         page = replace(page, seed=0 if config.compare else first_seed(learned))
     return worlds, page, options

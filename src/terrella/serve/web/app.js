@@ -10,6 +10,7 @@ import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { Past, write } from './past.js';
 import { takePictures } from './picture.js';
+import { reach } from './place/reach.js';
 import { Screens } from './screens.js';
 import { Uncertainty } from './uncertainty.js';
 import { Views } from './views.js';
@@ -19,7 +20,7 @@ const app = $('app'), KEPT = 8192;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
-let worlds = [], light = () => {}, status = {}, noRecord = '', command = '', state = 'connecting';
+let worlds = [], light = () => {}, status = {}, noRecord = '', recordIn = '', command = '', state = 'connecting';
 let pending = null, controlsId = 0, autoPaused = false, recordSince = 0;
 
 // -- the connection -------------------------------------------------------------------------------------------------
@@ -79,7 +80,7 @@ function onEvent(body) {
 
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
-  ({ worlds, no_record: noRecord, command } = body);
+  ({ worlds, no_record: noRecord, command, record_in: recordIn } = body);
   if (body.home) $('brand').href = `/start?${link.params()}`;
   driver.take(body);
   past.take(worlds[0], body.no_rewind);
@@ -94,7 +95,7 @@ function hello(body) {
 }
 
 function onStatus(body) {
-  if (body.notice && body.notice !== status.notice) toast(body.notice);
+  if (body.notice && body.notice !== status.notice) toast(/^saved/.test(body.notice) && recordIn ? `${body.notice.slice(0, -1)} to ${recordIn}.` : body.notice);
   if (body.recording && !status.recording) recordSince = performance.now();
   status = body;
   app.classList.toggle('recording', !!body.recording);

@@ -1,4 +1,4 @@
-// The cards of the worlds as lists of facts.
+// The cards of the worlds: who draws, what was learned from what, how large and how quick, in words; all facts behind a fold.
 
 /** A fact for people: few digits, no braces. */
 function say(value) {
@@ -19,14 +19,37 @@ function fill(list, name, value) {
   list.append(term, fact);
 }
 
+const time = (seconds) => (seconds < 90 ? `${Math.round(seconds)} seconds` : seconds < 5400 ? `${Math.round(seconds / 60)} minutes` : `${(seconds / 3600).toFixed(1)} hours`);
+const large = (count) => (count >= 1e6 ? `${(count / 1e6).toPrecision(2)} million` : count.toLocaleString('en'));
+
+/** What a person asks first, as [word, sentence]. */
+function plainly({ card, dt_s: dt, cameras, mapped }) {
+  const frames = Number(String(card.data ?? '').match(/^([\d,]+) frames/)?.[1].replaceAll(',', ''));
+  const [height, width] = cameras[0].size, learned = card.kind === 'learned' || card.kind === 'latent';
+  return [
+    ['Learned from', frames ? `${card.data}: ${time(frames * dt)} of play` : card.data],
+    ['Trained for', card.hours ? `${time(3600 * card.hours)}${/CPU/.test(card.hardware ?? '') ? ' on a CPU' : ''}` : null],
+    ['Its network', card.parameters ? `${large(card.parameters)} weights` : null],
+    ['Pictures', `${width} × ${height} pixels, ${Math.round(1 / dt)} steps a second`],
+    ['Memory', card.keyframes ? `${large(card.keyframes)} views of the recording, and what you see on your way` : learned && !mapped ? 'its last pictures' : null],
+    ['Never seen', card.keep_out ? 'A part of the map was kept out of training. What you see there is invented.' : null],
+    ['Usual error', card.uncertainty?.sure ? `${(100 * card.uncertainty.sure).toFixed(1)}% of full brightness, in a picture that it is sure of` : null],
+    ['Physics', card.physics],
+  ].filter(([, words]) => words);
+}
+
 export function drawCard(root, worlds) {
   root.replaceChildren();
   for (const world of worlds) {
-    const [title, what, list] = ['h2', 'p', 'dl'].map((tag) => document.createElement(tag));
-    const { what: words = '', ...facts } = world.card;
+    const [title, drawn, what, short, fold, all, list] = ['h2', 'p', 'p', 'dl', 'details', 'summary', 'dl'].map((tag) => document.createElement(tag));
+    const { what: words = '', kind, seed, ...facts } = world.card;
     title.textContent = world.label ? `${world.name}, the ${world.label}` : world.name;
-    what.textContent = words;
-    fill(list, '', { ...Object.fromEntries(world.cameras.map(({ name, size }) => [world.cameras.length > 1 ? `picture, ${name}` : 'picture', `${size[1]} × ${size[0]}`])), pace: `${Math.round(1 / world.dt_s)} steps/s`, ...facts });
-    root.append(title, what, list);
+    [drawn.textContent, drawn.className, what.textContent] = [world.drawn, 'drawn', words && `${words.replace(/\.$/, '')}.`];
+    for (const [word, sentence] of plainly(world)) fill(short, word, sentence);
+    all.textContent = 'All facts on its card';
+    const sizes = Object.fromEntries(world.cameras.map(({ name, size }) => [world.cameras.length > 1 ? `picture, ${name}` : 'picture', `${size[1]} × ${size[0]}`]));
+    fill(list, '', { ...sizes, pace: `${Math.round(1 / world.dt_s)} steps/s`, ...facts });
+    fold.append(all, list);
+    root.append(title, ...[drawn, what].filter((one) => one.textContent), short, fold);
   }
 }
