@@ -152,6 +152,8 @@ def kinds(text: str) -> tuple[Counter, tuple[str, ...]]:
         ("a room with two doors", {"door": 2}, ()),
         ("a study without windows or doors and a lamp", {"window": 0, "door": 0, "lamp": 1}, ()),
         ("a room with no window", {"window": 0}, ()),
+        ("a hall with a row of pillars", {"pillar": 4}, ("row",)),
+        ("a pair of chairs in a study", {"chair": 2, "room": 1}, ()),
         ("a kitchen with a dozen stools", {"stool": 12}, ()),
         ("a room with thirteen boxes", {"box": 13}, ()),
         ("three bedrooms with a window", {"room": 3, "window": 3, "door": 2}, ()),

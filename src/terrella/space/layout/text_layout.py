@@ -38,7 +38,7 @@ SIZES = {
 }  # fmt: skip
 _ONES = ("zero one two three four five six seven eight nine ten eleven twelve thirteen fourteen fifteen sixteen seventeen eighteen "
          "nineteen twenty")  # fmt: skip
-NUMBERS = {**{word: at for at, word in enumerate(_ONES.split())}, "a": 1, "an": 1, "single": 1, "some": 3, "few": 3,
+NUMBERS = {**{word: at for at, word in enumerate(_ONES.split())}, "single": 1, "some": 3, "few": 3,
            "several": 4, "many": 6, "lots": 6}  # fmt: skip
 GROUPS = {"pair": 2, "pairs": 2, "couple": 2, "dozen": 12, "dozens": 12, "hundred": 100}
 PLURALS = {"pillar": 4, "chair": 4, "door": 2, "stairs": 1, "room": 2}  # how many without a number; of others 3
@@ -163,6 +163,8 @@ class _Reader:
             self._drop()
         if word in _NONE:
             self.none = True
+        elif word in ("a", "an"):  # no number: "a row of pillars"
+            self._drop() if self.waiting else None
         elif word in SIDES and self._is_side(word):
             self._set_side(word)
         elif word in NUMBERS or word in GROUPS or word.isdigit():
@@ -215,9 +217,8 @@ class _Reader:
         else:
             self._drop() if self.waiting else None
             self.count = min(NUMBERS[word] if word in NUMBERS else int(word[:9]), MOST_COUNT)
-            self.none = self.none and word in ("a", "an", "single", "some")
-        if word not in ("a", "an"):
-            self.waiting.append(word)
+            self.none = self.none and word in ("single", "some")
+        self.waiting.append(word)
 
     def _taken(self, noun: str, word: str) -> int:
         """How many of a noun there are to be; its phrase ends here."""
