@@ -170,8 +170,9 @@ POINTS = {
 @pytest.mark.parametrize("kind", POINTS)
 def test_known_points_in_any_form_of_ply(tmp_path, kind):
     saved(tmp_path, "a.png")
-    (tmp_path / "points.ply").write_bytes(POINTS[kind])
-    listed(tmp_path, "a.png", ply_file_path="points.ply")
+    (tmp_path / "sfm").mkdir()
+    (tmp_path / "sfm/my points.ply").write_bytes(POINTS[kind])
+    listed(tmp_path, "a.png", ply_file_path="sfm\\my%20points.ply")
     shots = read_transforms(tmp_path)
     assert shots.points.tolist() == [[1, 2, 3], [4, 5, 6]] and not shots.left_out
 

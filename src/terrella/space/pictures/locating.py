@@ -15,7 +15,7 @@ def locate(homes: Sequence[Path], names: Sequence[str]) -> list[Path | None]:
     ending (as in Blender's sets), or be paths of another machine: then the only picture below the last home whose path ends alike,
     and that no other name means."""
     files = [
-        next((file for home in homes for one in _spellings(name) if (file := _with_ending(home / one))), None)
+        next((file for home in homes for one in spellings(name) if (file := _with_ending(home / one))), None)
         for name in names
     ]
     if None in files:
@@ -26,7 +26,8 @@ def locate(homes: Sequence[Path], names: Sequence[str]) -> list[Path | None]:
     return files
 
 
-def _spellings(name: str) -> list[str]:
+def spellings(name: str) -> list[str]:
+    """A name as it is, with slashes for backslashes, and without %20."""
     return list(dict.fromkeys([name, name.replace("\\", "/"), unquote(name), unquote(name.replace("\\", "/"))]))
 
 
@@ -51,7 +52,7 @@ def _by_tail(home: Path) -> dict[str, list[Path]]:
 
 
 def _relocated(name: str, tails: dict[str, list[Path]], taken: set[Path | None]) -> Path | None:
-    parts = [part for part in _spellings(name)[-1].casefold().split("/") if part not in ("", ".", "..")]
+    parts = [part for part in spellings(name)[-1].casefold().split("/") if part not in ("", ".", "..")]
     for first in range(len(parts)):
         files = [file for file in tails.get("/".join(parts[first:]), ()) if file not in taken]
         if files:

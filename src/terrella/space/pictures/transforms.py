@@ -9,7 +9,7 @@ import torch
 
 from ...core.errors import DatasetError
 from ..files import ply
-from .locating import locate
+from .locating import locate, spellings
 from .posed import Lens, Shots, absent, pose_of
 from .reading import read_picture
 
@@ -118,7 +118,7 @@ def _points(folder: Path, name: Any) -> tuple[torch.Tensor, list[str]]:
     """Known points [N, 3], and the file of points if it is of no use."""
     if not name:
         return torch.zeros(0, 3), []
-    file = next((one for one in (folder / str(name), folder / str(name).replace("\\", "/")) if one.is_file()), None)
+    file = next((one for spelling in spellings(str(name)) if (one := folder / spelling).is_file()), None)
     try:
         if file is None:
             return torch.zeros(0, 3), [absent(str(name))]
