@@ -157,8 +157,13 @@ def folder_of(name: str | Path) -> Path:
     if (BUNDLED / text / "world.json").is_file():
         return BUNDLED / text
     if Path(text).exists():
-        run = Path(text) / "world"  # where `terrella train` leaves the world of a run
-        return run if (run / "world.json").is_file() else Path(text)
+        runs = (
+            Path(text) / "world",
+            Path(text) / "run" / "world",
+        )  # where `terrella train` and `terrella learn` leave the world
+        if (Path(text) / "learn.json").is_file() and not (runs[1] / "world.json").is_file():
+            raise TerrellaError(f"{text} has no world yet: `learn` saves the first one soon after its training begins.")
+        return next((run for run in runs if (run / "world.json").is_file()), Path(text))
     bundled = sorted(_bundled())
     environment = f"; did you mean 'gym:{text}'?" if re.search(r"-v\d+$", text) else ""
     hint = environment or did_you_mean(text, [*bundled, GAME]) or "."

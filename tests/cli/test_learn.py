@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,13 +13,16 @@ from pathlib import Path
 
 import pytest
 
+from terrella import library
 from terrella.cli import main
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
+from terrella.learn.recipes.video import TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
 from terrella.workflows.learn import held_to_real_time
 from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from terrella.workflows.learn_trial import Pace, forecast, time_environment
 from terrella.workflows.opening import EnvironmentConfig
 
 from .tiny import NAME
@@ -47,7 +51,7 @@ def test_the_minutes_are_divided_and_none_is_left_over(minutes, tmp_path):
     assert plan.share_s[TRAINING] > share[TRAINING]
     plan.spent[TRAINING] = plan.seconds  # later than was planned
     plan.note(TRAINING, {})
-    assert 0 < plan.left_s(SCORING) <= share[SCORING]
+    assert 0 <= plan.left_s(SCORING) <= share[SCORING], "nothing is promised beyond the minutes"
 
 
 def test_a_plan_goes_on_with_its_own_settings_alone(tmp_path):
@@ -123,7 +127,7 @@ def test_of_a_fast_game_every_action_is_held_so_that_it_is_played_in_real_time()
 
 
 def command(out: Path) -> list[str]:
-    return ["learn", NAME, "--minutes", "0.5", "--frames", str(FRAMES), "--out", str(out)]
+    return ["learn", NAME, "--minutes", "5", "--frames", str(FRAMES), "--out", str(out)]
 
 
 def killed_while_recording(out: Path) -> None:
@@ -136,9 +140,11 @@ def killed_while_recording(out: Path) -> None:
 
 
 def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_path, capsys, monkeypatch):
-    shares = {RECORDING: 60.0, TRAINING: 1.0, SCORING: 1.0}  # recording ends with its frames, training with its steps
+    shares = {RECORDING: 60.0, TRAINING: 1.0, SCORING: 60.0}  # recording ends with its frames, training with its steps
     monkeypatch.setattr(LearnSchedule, "share_s", property(lambda schedule: shares))
     monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 8)
+    monkeypatch.setattr("terrella.workflows.learn.HOPELESS_STEPS", 5)
+    monkeypatch.setattr("terrella.workflows.learn.CLIP_COUNTS", (3,))
     out = tmp_path / "tiny"
     killed_while_recording(out)
     stepped = Trainer._step
@@ -157,14 +163,41 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     assert main([*command(out), "--json"]) == 0
     told = capsys.readouterr()
     facts = json.loads(told.out)
-    assert "Goes on in" in told.err and "trains for" in told.err and "records for" not in told.err
+    assert "Continues in" in told.err and "trains for" in told.err and "records for" not in told.err
     assert "copying the last" in facts["verdict"][0] and facts["play"].endswith("run")
     assert (out / "run" / "world" / "world.json").exists() and Path(facts["card"]).stat().st_size > 0
     assert main(command(out)) == 0
     again = capsys.readouterr()
     assert "is finished" in again.err and facts["verdict"][0] in again.out and "play it: terrella play" in again.out
+    assert f"train it further: terrella learn {NAME} --minutes " in again.out and f"--out {out}" in again.out
+    assert library.folder_of(out) == out / "run" / "world" and (out / "run" / "newest.png").exists()
     assert main([*command(out), "--seed", "5"]) == 2
     assert "seed 0, not 5" in capsys.readouterr().err
+
+
+PACE = TrainingPace(setup_s=5.0, step_s=0.5, share=0.6)
+
+
+@pytest.mark.parametrize("minutes, training_s", [(1, 30), (2, 80)])
+def test_too_few_minutes_are_refused_with_the_number_that_is_enough(minutes, training_s):
+    with pytest.raises(TerrellaError, match=r"too few on this machine.* Give --minutes 1[0-9] or more") as refused:
+        forecast(Pace(50.0, PACE), minutes, 600, training_s)
+    better = int(re.search(r"--minutes (\d+)", str(refused.value))[1])
+    assert "That is little" not in forecast(Pace(50.0, PACE), better, 600, 60 * better * 0.75), "the advice holds"
+
+
+def test_what_the_minutes_give_is_said_before_they_are_spent(tmp_path, capsys, monkeypatch):
+    said = forecast(Pace(50.0, PACE), 5, 4000, 220)
+    assert "4,000 frames" in said and "254 training steps" in said and "That is little: --minutes" in said
+    out = tmp_path / "hopeless"
+    monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: Pace(50.0, PACE._replace(step_s=60.0)))
+    assert main(command(out)) == 2 and "too few on this machine" in capsys.readouterr().err
+    assert not out.exists(), "a refusal leaves nothing"
+
+
+def test_the_trial_times_a_recording_and_training_steps():
+    pace = time_environment(EnvironmentConfig().open(NAME), 0)
+    assert pace.frames_per_s > 1 and 0 < pace.training.step_s < 60 and 0.3 < pace.training.share < 0.9
 
 
 def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monkeypatch):
@@ -179,15 +212,17 @@ def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monk
     monkeypatch.setattr("terrella.workflows.learn.explore", slow)
     monkeypatch.setattr("terrella.workflows.progress.LINE_EVERY_S", -1.0)
     monkeypatch.setattr(LearnSchedule, "share_s", property(lambda plan: {RECORDING: 0.0, TRAINING: 1.0, SCORING: 1.0}))
+    monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: None)
     main(command(tmp_path / "slow"))
     assert enough == [False, False, False, True]
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("recording")]
+    said = [line for line in capsys.readouterr().err.splitlines() if " recording " in line and "%" in line]
     assert ["a slow game: until it has 600 frames" in line for line in said[1:4]] == [True, True, False]
 
 
 def test_too_few_frames_are_said_and_kept(tmp_path, capsys, monkeypatch):
     few = lambda world, out, frames, *rest, **more: explore(world, out, 20, *rest, **more)  # noqa: E731
     monkeypatch.setattr("terrella.workflows.learn.explore", few)
+    monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: None)
     out = tmp_path / "few"
     assert main(command(out)) == 2
     assert "20 frames" in (said := capsys.readouterr().err) and "goes on recording" in said

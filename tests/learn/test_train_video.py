@@ -73,7 +73,7 @@ def test_a_kill_while_a_generator_is_tuned_leaves_its_world_and_it_draws_with_th
     def killed(*_):
         raise KeyboardInterrupt
 
-    def chosen(world, codec, recording, stress, seed):
+    def chosen(world, codec, recording, stress, seed, frames):
         codec.stress.fill_(5.0)
         return 1.4
 

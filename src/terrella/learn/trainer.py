@@ -224,7 +224,7 @@ class Trainer:
     @property
     def summary(self) -> dict[str, Any]:
         """The facts without those that only a resumed run needs."""
-        inner = ("recipe", "recent", "feed", "spent", "asked")
+        inner = ("recipe", "recent", "feed", "spent", "asked", "shares")
         return {name: fact for name, fact in self.facts.items() if name not in inner} | {"step": self.steps_done}
 
     @property
@@ -274,6 +274,15 @@ class Trainer:
         if stop.is_set():
             done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"
             raise KeyboardInterrupt(f"{done}; the same command continues.")
+
+    def time_steps(self, most_s: float) -> float:
+        """Seconds of a gradient step, timed after a first batch for about `most_s` at most. It changes the modules."""
+        self._step(0)
+        began, batches = time.monotonic(), 0
+        while not batches or (batches < 10 and time.monotonic() - began < most_s):
+            batches += 1
+            self._step(batches)
+        return (time.monotonic() - began) / (batches * self.strides)
 
     def _step(self, step: int) -> dict[str, float]:
         """One batch, and one gradient step for each of its losses in turn. Returns the means of the losses' parts."""

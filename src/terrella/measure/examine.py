@@ -71,15 +71,15 @@ def examine(
 def most_clips_within(
     exam: Exam, seconds: float, sizes: Sequence[int], clock: Clock = time.monotonic, probes: Sequence[Probe] = PROBES
 ) -> int:
-    """The largest number of clips, of `sizes`, with which the examination is forecast to take at most `seconds`; the smallest if
-    all take longer."""
+    """The largest number of clips, of `sizes`, with which the examination is forecast to take at most `seconds`; 0 if all take
+    longer."""
     forecast = Forecast(_prices(exam, clock))
     for size in sorted(sizes, reverse=True):
         some = exam.of(size)
         units = dreams(some, probes) + [unit for probe in probes for unit in probe.units(some)]
         if sum(map(forecast.seconds, units)) <= seconds:
             return size
-    return min(sizes)
+    return 0
 
 
 def _prices(exam: Exam, clock: Clock) -> Calls:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,11 @@ from ..learn.recording import MOST, learned_size
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, time_environment
 from .opening import ControlsConfig, EnvironmentConfig
 from .progress import Progress, Report, duration, silent, stage
 from .recording_facts import describe, recording_facts
-from .results import jsonable
+from .results import changed_settings, command, jsonable
 from .score import QUICK_HORIZONS, ExamRequest, arms_of, exam_of, write_card
 
 ENDLESS = 10**9  # steps: training ends with its time
@@ -30,12 +31,12 @@ SMALL = (
     64 * 96
 )  # pixels of a picture at most, in fewer minutes than SHORT_MIN: more pixels learn too little in that time
 SHORT_MIN = 60
-FEW_FRAMES, FEWEST_FRAMES = 600, 100  # a slow game is recorded for up to half of the time until it has 600 frames
+FEW_FRAMES, FEWEST_FRAMES = 600, 100  # a slow game is recorded for up to a third of the time until it has 600 frames
 REAL_TIME_FPS, HELD_FPS = (
     32,
     25,
 )  # steps per second that a learned world plays on two cores; faster games are held to 25
-FEW_STEPS = 600  # training steps after which a world has learned next to nothing
+STRIPS = 20  # pictures of truth and prediction in a training, at most
 _DOES = {RECORDING: "records for up to", TRAINING: "trains for", SCORING: "scores for"}
 _DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for"}
 
@@ -63,20 +64,26 @@ class LearnResult:
     card: Path | None  # The page of the scorecard; None where too little was recorded to score.
     spent_s: Mapping[str, float]  # Seconds of each stage: recording, training, scoring.
 
+    again: str  # The command that trains it further.
+    steps: int  # Training steps so far.
+
     @property
     def play(self) -> str:
-        return f"terrella play {self.world}"
+        return command("terrella", "play", self.world)
 
     def to_json(self) -> dict[str, Any]:
         facts: dict[str, Any] = {"verdict": self.verdict} | ({"card": self.card} if self.card else {})
         minutes = {f"{name}_minutes": round(seconds / 60, 2) for name, seconds in self.spent_s.items()}
-        return jsonable({**facts, "world": self.world, "play": self.play, **minutes})
+        following = {"play": self.play, "train_further": self.again}
+        return jsonable({**facts, "world": self.world, "steps": self.steps, **following, **minutes})
 
     def summary(self) -> str:
-        lines = [*self.verdict, f"play it: {self.play}"]
-        lines += [f"the card: {self.card}"] if self.card else []
         stages = ", ".join(f"{text} {duration(self.spent_s[name])}" for name, text in _DID.items())
-        return "\n".join([*lines, f"It took {duration(sum(self.spent_s.values()))}: {stages}."])
+        lines = [*self.verdict, f"It took {duration(sum(self.spent_s.values()))}: {stages}."]
+        lines += [f"the card: {self.card}"] if self.card else []
+        few = f"{self.steps} training steps are too few to play it yet." if self.steps < HOPELESS_STEPS else ""
+        lines.append(few or f"play it: {self.play}")
+        return "\n".join([*lines, f"train it further: {self.again}"])
 
 
 def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Progress = silent) -> LearnResult:
@@ -95,7 +102,11 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
         _Learning(environment, config, schedule, progress).run()
     score = schedule.facts[SCORING]
     card = Path(score["card"]) if "card" in score else None
-    return LearnResult(tuple(score["verdict"]), schedule.folder / "run", card, dict(schedule.spent))
+    steps = int(schedule.facts[TRAINING].get("steps", 0))
+    lacking = max(0, FEW_STEPS - steps) * schedule.spent[TRAINING] / max(steps, 1) / 60
+    longer = {**changed_settings(config), "minutes": math.ceil(max(2 * schedule.minutes, schedule.minutes + lacking))}
+    again = command("terrella", "learn", environment, **longer)
+    return LearnResult(tuple(score["verdict"]), schedule.folder / "run", card, dict(schedule.spent), again, steps)
 
 
 def check_budget(minutes: float, frames: int) -> None:
@@ -118,29 +129,55 @@ class _Learning:
         schedule, progress = self.schedule, self.progress
         spent = ", ".join(f"{text} {duration(schedule.spent[at])}" for at, text in _DID.items() if schedule.spent[at])
         if spent:
-            progress(f"Goes on in {schedule.folder}: {spent} so far.")
+            progress(f"Continues in {schedule.folder}: {spent} so far.")
         if RECORDING in schedule.facts:
             self._announce()
-        for name, work in ((RECORDING, self._record), (TRAINING, self._train), (SCORING, self._score)):
-            if name in schedule.facts:
-                continue
-            try:
-                with stage(name, progress) as shown, schedule.stage(name, shown) as report:
-                    facts = work(report)
-            except KeyboardInterrupt as stop:
-                raise KeyboardInterrupt(str(stop) or f"stopped while {name}; the same command continues.") from stop
-            except Exception:
-                schedule.forget()
-                raise
-            schedule.note(name, facts)
-            if name != SCORING:
-                progress(f"{_DID[name].capitalize()} {duration(schedule.spent[name])}: {_in_words(facts)}")
+        with stage(f"learning {schedule.folder.name}", progress) as shown:
+            for name, work in ((RECORDING, self._record), (TRAINING, self._train), (SCORING, self._score)):
+                if name not in schedule.facts:
+                    self._do(name, work, shown)
+
+    def _do(self, name: str, work: Callable[[Report], dict[str, object]], shown: Report) -> None:
+        """One stage. All share one bar, that of the minutes."""
+        schedule = self.schedule
+        try:
+            with schedule.stage(name, shown) as report:
+                facts = work(report)
+        except KeyboardInterrupt as stop:
+            raise KeyboardInterrupt(str(stop) or f"stopped while {name}; the same command continues.") from stop
+        except Exception:
+            schedule.forget()
+            raise
+        schedule.note(name, facts)
+        if name != SCORING:
+            self.progress(f"{_DID[name].capitalize()} {duration(schedule.spent[name])}: {_in_words(facts)}")
 
     def _announce(self) -> None:
         """One line about the stages to come, with their times."""
         schedule = self.schedule
         parts = [f"{text} {duration(schedule.left_s(at))}" for at, text in _DOES.items() if at not in schedule.facts]
         self.progress(f"Of {duration(schedule.seconds)} it {', '.join(parts)}; all files are in {schedule.folder}.")
+        self.progress(
+            f"From {duration(self._strip_s)} after training begins, `{command('terrella', 'play', schedule.folder)}` plays the "
+            f"newest state of the world (start it again for a newer one), and {schedule.live_page()} shows truth and prediction."
+        )
+
+    @property
+    def _strip_s(self) -> float:
+        """Seconds between pictures of truth and prediction, and between states of the world that can be played."""
+        return min(120.0, max(15.0, self.schedule.share_s[TRAINING] / STRIPS))
+
+    def _foresee(self, world: World) -> None:
+        """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
+        schedule = self.schedule
+        pace = time_environment(world, self.config.seed)
+        if pace is None:
+            return
+        recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
+        frames = min(self.config.frames, int(recorded_s * pace.frames_per_s))
+        recorded_s = frames / pace.frames_per_s
+        training_s = schedule.seconds - schedule.spent[RECORDING] - recorded_s - schedule.share_s[SCORING]
+        self.progress(forecast(pace, schedule.minutes, frames, training_s))
 
     def _record(self, report: Report) -> dict[str, object]:
         schedule, name, environment = self.schedule, self.name, self.config.environment
@@ -148,6 +185,10 @@ class _Learning:
         opened = schedule.facts.setdefault("opened", first)
         most = SMALL if schedule.seconds < 60 * SHORT_MIN else MOST
         world = self.config.controls.of(open_small(opened, environment, most))
+        if not schedule.has_recording:
+            self.progress("A trial of some seconds: what does this machine manage?")
+            self._foresee(world)
+            schedule.facts["trial_s"] = schedule.elapsed_s
         self._announce()  # after it was opened: nothing is announced of an environment that does not open
         if opened != name:
             held = opened.rpartition("@")[2]
@@ -165,14 +206,13 @@ class _Learning:
         def overtime_s() -> float:
             """Seconds beyond the stage's time that a slow game needs for a few frames, at this pace."""
             spent = schedule.spent[RECORDING]
-            return min(schedule.seconds / 2 - spent, (FEW_FRAMES / max(rows, 1) - 1) * spent)
+            return min(schedule.seconds / 3 - spent, (FEW_FRAMES / max(rows, 1) - 1) * spent)
 
-        def counted(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
+        def counted(done: float, total: float, text: str = "") -> None:
             nonlocal rows
             rows = done
             late = schedule.left_s(RECORDING) <= 0 < overtime_s()
-            slow = (f"a slow game: until it has {FEW_FRAMES} frames", overtime_s())
-            report(done, total, *(slow if late else (text, left_s)))
+            report(done, total, f"a slow game: until it has {FEW_FRAMES} frames" if late else text)
 
         def enough() -> bool:
             return schedule.left_s(RECORDING) <= 0 and overtime_s() <= 0
@@ -190,13 +230,9 @@ class _Learning:
     def _train(self, report: Report) -> dict[str, object]:
         folder = self.schedule.folder
         hours = self.schedule.share_s[TRAINING] / 3600
-        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
+        every = {"save_every_s": SAVE_EVERY_S, "strip_every_s": self._strip_s}
+        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, **every)
         facts = train_video(folder / RECORDING, folder / "run", config, report)
-        if facts["step"] < FEW_STEPS:
-            self.progress(
-                f"Warning: there was time for {facts['step']} training steps only; the same command with more --minutes trains "
-                "it on."
-            )
         return {"world": facts["world"], "steps": facts["step"]}
 
     def _score(self, report: Report) -> dict[str, object]:
@@ -212,6 +248,9 @@ class _Learning:
         report(0, 1, "measuring how fast the world is")
         if "clips" not in schedule.facts:
             schedule.note("clips", most_clips_within(exam, schedule.left_s(SCORING), CLIP_COUNTS))
+        if not schedule.facts["clips"]:
+            later = command("terrella", "score", run, data=data, quick=True)
+            return {"verdict": [f"{schedule.folder.name} is not scored: no time was left. Score it: {later}"]}
         exam = exam.of(schedule.facts["clips"])
         card, files = write_card(run, exam, identity, schedule.folder / "score", report)
         return {"verdict": verdict(card), "card": str(files[1])}

@@ -1,5 +1,6 @@
 """The schedule of `learn`: how its minutes are divided among its stages, and what is done of it, kept in a file."""
 
+import html
 import json
 import re
 import shutil
@@ -16,6 +17,13 @@ from .progress import Report
 RECORDING, TRAINING, SCORING = "recording", "training", "scoring"
 STARTING_S = 5.0  # of each stage, for imports and for reading again
 SAVE_EVERY_S = 5.0
+PAGE = "live.html"
+LIVE = """<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="10"><title>{name}</title>
+<body style="background:#111;color:#ddd;font:16px sans-serif">
+<p>{name} while it trains: the recording above, the world's own prediction from its first picture below; 8 steps from picture to
+picture. The page reloads itself; it is empty until the first picture is there.
+<p><img src="run/newest.png" alt="" style="width:100%;image-rendering:pixelated">
+"""
 
 
 def folder_for(name: str) -> Path:
@@ -64,23 +72,37 @@ class LearnSchedule:
         return (self.folder / RECORDING / "meta" / "info.json").exists()
 
     @property
+    def elapsed_s(self) -> float:
+        """Seconds since the last stage ended, or this run began."""
+        return time.monotonic() - self._began
+
+    @property
     def share_s(self) -> dict[str, float]:
         """Seconds of each stage. Recording has an eighth, scoring a fifteenth (between one and ten minutes, at most a fifth);
         training has the rest."""
         scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 5)
-        recording = self.spent[RECORDING] if RECORDING in self.facts else self.seconds / 8
+        recording = self.seconds / 8 + self.facts.get("trial_s", 0.0)
+        recording = self.spent[RECORDING] if RECORDING in self.facts else recording
         training = self.seconds - recording - scoring - STARTING_S
         return {RECORDING: recording, TRAINING: max(training, 1.0), SCORING: scoring}
+
+    def live_page(self) -> str:
+        """The address of a page of the newest picture of truth and prediction, which is written."""
+        page = self.folder / PAGE
+        if not page.exists():
+            page.parent.mkdir(parents=True, exist_ok=True)
+            page.write_text(LIVE.format(name=html.escape(self.folder.name)), encoding="utf-8")
+        return page.resolve().as_uri()
 
     def left_s(self, stage: str) -> float:
         """Seconds until a stage should end; for the last stage, until the command should."""
         if stage == SCORING and TRAINING in self.facts:
-            return max(self.seconds - sum(self.spent.values()), self.share_s[SCORING] / 2)
+            return max(self.seconds - sum(self.spent.values()), 0.0)
         return self.share_s[stage] - self.spent[stage]
 
     @contextmanager
     def stage(self, name: str, report: Report) -> Iterator[Report]:
-        """Counts the time of a stage, from the end of the last one. Gives a `report` that adds the time left by schedule."""
+        """Counts the time of a stage, from the end of the last one. Gives a `report` that shows it as a part of all the minutes."""
         before, began, saved = self.spent[name], self._began, 0.0
 
         def timed(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
@@ -89,7 +111,9 @@ class LearnSchedule:
             if time.monotonic() - saved > SAVE_EVERY_S:
                 saved = time.monotonic()
                 self.save()
-            report(done, total, text, max(1.0, self.left_s(name)) if left_s is None else left_s)
+            share = f"{done / total:.0%}" if total else f"{done:,g}"
+            spent = min(sum(self.spent.values()), 0.99 * self.seconds)
+            report(spent, self.seconds, " ".join(filter(None, [name, share, text])), max(1.0, self.seconds - spent))
 
         try:
             yield timed
@@ -113,6 +137,7 @@ class LearnSchedule:
         if self.has_recording or not self._file.exists():
             return
         shutil.rmtree(self.folder / RECORDING, ignore_errors=True)
+        (self.folder / PAGE).unlink(missing_ok=True)
         self._file.unlink()
         if not any(self.folder.iterdir()):
             self.folder.rmdir()

@@ -2,7 +2,9 @@
 
 import math
 import re
+import shlex
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,6 +36,28 @@ def table_lines(heads: list[str], rows: list[list[str]]) -> list[str]:
     """Rows of text under their heads, in columns."""
     widths = [max(len(row[at]) for row in [heads, *rows]) for at in range(len(heads))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in [heads, *rows]]
+
+
+def command(*words: object, **options: object) -> str:
+    """A command that can be pasted into a shell. options: its --options; those without a value (None, False, ()) are left out."""
+    given = [str(word) for word in words]
+    for name, value in options.items():
+        if value is not None and value is not False and value != ():
+            values = value if isinstance(value, tuple) else () if value is True else (value,)
+            given += [f"--{name.replace('_', '-')}", *map(str, values)]
+    return shlex.join(given)
+
+
+def changed_settings(config: Any) -> dict[str, Any]:
+    """The settings of a dataclass, and of those in it, that differ from their defaults: name -> value, as `command` takes them."""
+    changed: dict[str, Any] = {}
+    for part in fields(config):
+        value = getattr(config, part.name)
+        if is_dataclass(value):
+            changed |= changed_settings(value)
+        elif value != part.default:
+            changed |= {f"no_{part.name}": True} if value is False else {part.name: value}
+    return changed
 
 
 def folder_name(world: str) -> str:

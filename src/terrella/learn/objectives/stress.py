@@ -32,14 +32,18 @@ def observed(
 
 
 @torch.inference_mode()
-def choose_stress(world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int) -> float:
+def choose_stress(
+    world: LearnedWorld, codec: Codec, recording: Recording, stress: float, seed: int, frames: int = FRAMES
+) -> float:
     """The power of POWERS with which rollouts of recorded episodes have the lowest error, by the mean logarithm of the pooled
     squared error after 1, 2, 4, ... steps; among nearly equal ones, the power with which as many pixels change in a step as in the
-    recording (motion that stops or fades costs hardly any error). Sets the `stress` of `codec` to that power of `stress`."""
+    recording (motion that stops or fades costs hardly any error). At most `frames` are drawn. Sets the `stress` of `codec` to that
+    power of `stress`."""
     codec.stress.fill_(stress**USUAL)
     length, rng = steps_ahead(recording), np.random.default_rng([seed, 11])
     many = max((length > SHOWN).sum() / 2, CLIPS)  # of the rows from which a rollout may begin
-    steps = next((steps for steps in STEPS if (length >= SHOWN + steps).sum() >= many), 0)
+    fits = [steps for steps in STEPS if CLIPS * (SHOWN + steps * len(POWERS)) <= frames]
+    steps = next((steps for steps in fits if (length >= SHOWN + steps).sum() >= many), 0)
     if not steps or stress < NEGLIGIBLE:
         return USUAL
     begins = rng.choice(np.flatnonzero(length >= SHOWN + steps), CLIPS, replace=False)

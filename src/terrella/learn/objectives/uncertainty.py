@@ -60,12 +60,13 @@ class DreamFrames(NamedTuple):
 
 @dataclass(frozen=True)
 class DreamSettings:
-    """How rollouts are made: `frames` in all, `horizon` steps each, `batch` at a time."""
+    """How rollouts are made: `frames` in all, `horizon` steps each, `batch` at a time, after a number of `shown` frames."""
 
     frames: int = 12_000
     horizon: int = 64
     batch: int = 6
     seed: int = 0
+    shown: tuple[int, ...] = SHOWN
 
     @property
     def batches(self) -> int:
@@ -123,11 +124,13 @@ def dreaming_seconds(world: LearnedWorld, recording: Recording, frames: int) -> 
 
 def _dreamt_s(world: LearnedWorld, recording: Recording, horizon: int) -> tuple[float, DreamFrames]:
     """Seconds a frame of a rollout, and some frames."""
-    trial = DreamSettings(0, min(24, horizon))  # no shorter: the frames that a rollout observes first take time, too
-    dream(world, recording, replace(trial, horizon=4), 0)  # compiles
+    trial = DreamSettings(0, 4, shown=(1,))
+    dream(world, recording, replace(trial, horizon=1), 0)  # compiles
     began = time.monotonic()
     seen = dream(world, recording, trial, 0)
-    return (time.monotonic() - began) / (trial.horizon * trial.batch), seen
+    step_s = (time.monotonic() - began) / (1 + trial.horizon)
+    first = 2 * sum(SHOWN) / len(SHOWN)  # steps before a rollout: each shown frame is imagined and observed
+    return step_s * (first + horizon) / (horizon * trial.batch), seen
 
 
 def discard_uncertainty(out: Path) -> None:
@@ -182,7 +185,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
     if arm == LONE and not world.estimator:
         arm = NONE
     alone, horizon = arm == LONE, rollout.horizon
-    shown = 1 if alone else int(rng.choice(SHOWN))
+    shown = 1 if alone else int(rng.choice(rollout.shown))
     begins = rng.choice(np.flatnonzero(steps_ahead(recording) >= shown + horizon), rollout.batch)
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
     inputs: list[tuple[torch.Tensor, torch.Tensor]] = []

@@ -1,10 +1,17 @@
 """train video: a recording into a playable world. What is learned depends on the recording: video_posed.py, video_flat.py."""
 
+import os
+import shutil
+import time
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 import torch
 
 from ...core.errors import TrainingError
+from ...core.files import replacing
 from ...data import Dataset
 from ...worlds.folder import save_world
 from ...worlds.learned import LearnedWorld
@@ -19,11 +26,51 @@ from .video_flat import CodecRecipe, FlatFlowRecipe
 from .video_parts import VideoRecipe
 from .video_posed import PosedRecipe
 
+FEWEST_FRAMES = 200  # from which an uncertainty is learned
+BUSY = 1.5  # processes for each core from which a machine is busy
+TUNING = 0.06  # the part of the hours that tuning may take
 WHY = "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
 
 
 def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run."""
+    return _Training(_recipe(data, out, config, report)).learn()
+
+
+class TrainingPace(NamedTuple):
+    """How fast this machine trains: seconds before the generator's first step and of a gradient step, and the part of the hours
+    that are left for its steps at least."""
+
+    setup_s: float
+    step_s: float
+    share: float
+
+    def steps_in(self, seconds: float) -> int:
+        """The steps for which a run of so many seconds has time."""
+        return max(0, int((seconds * self.share - self.setup_s) / self.step_s))
+
+
+def time_training(data: str | Path, config: TrainConfig, seconds: float) -> TrainingPace:
+    """A trial of `seconds` or a few training steps, on a recording of a few frames. On a CPU it also sets PyTorch to one thread
+    where that is faster: on busy cores threads wait for each other."""
+    began = time.monotonic()
+    with TemporaryDirectory() as folder:
+        recipe = _recipe(data, folder, replace(config, hours=0.0), lambda *_: None)
+        setup_s, trained = time.monotonic() - began, _Training(recipe)
+        rest = sum(stage.share or 0.0 for stage in trained.stages) + TUNING
+        many, busy = torch.get_num_threads(), os.getloadavg()[0] > BUSY * (os.cpu_count() or 1)
+        counts = (many,) if recipe.parts.run.device.type != "cpu" else (1,) if busy else dict.fromkeys((1, many))
+        pace: dict[int, float] = {}
+        for threads in counts:
+            torch.set_num_threads(threads)
+            pace[threads] = trained.new_trainer().time_steps(seconds / len(counts))
+        best = min(pace, key=pace.__getitem__)
+        torch.set_num_threads(best)
+        return TrainingPace(setup_s, pace[best], 1 - rest)
+
+
+def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> VideoRecipe:
+    """What is learned from the recording. TrainingError or DatasetError for settings and recordings that do not fit."""
     if config.size and any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
@@ -35,7 +82,7 @@ def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: 
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
     make = PosedRecipe if video.geometry else CodecRecipe if config.flow_steps == 1 else FlatFlowRecipe
-    return _Training(make(run, recording, config, video)).learn()
+    return make(run, recording, config, video)
 
 
 class _Training:
@@ -57,11 +104,14 @@ class _Training:
         senses = self.trainer.facts.pop("senses")
         return {"world": str(self.run.out / "world"), **self.trainer.summary, **self.parts.facts, **senses}
 
-    def _train_generator(self) -> None:
+    def new_trainer(self) -> Trainer:
         feed = self.recipe.feed(self.config.batch or (64 if self.run.device.type == "cuda" else 8))
         objective = self.recipe.objective
         strides = objective.losses_per_batch
-        self.trainer = trainer = Trainer(self.run, "flow", feed, objective, self.config.steps, strides=strides)
+        return Trainer(self.run, "flow", feed, objective, self.config.steps, strides=strides)
+
+    def _train_generator(self) -> None:
+        self.trainer = trainer = self.new_trainer()
         trainer.limit_s = self._limit_s()
         if not trainer.finished:
             discard_uncertainty(self.run.out)  # it was fitted to the errors of an earlier generator
@@ -70,16 +120,19 @@ class _Training:
 
     def _limit_s(self) -> float:
         """Seconds of the generator's training: what the preparations left of the hours, less what tuning and uncertainty will
-        take by a trial. A finished run stays finished until it is given more hours."""
+        take by a trial. Where that is more than their parts of the hours, they make fewer rollouts: `shares` of the usual
+        number. A finished run stays finished until it is given more hours."""
         trainer, took_s = self.trainer, self.trainer.facts["seconds"]
         if self.config.hours <= trainer.facts.get("asked", 0.0):
             return took_s
         budget, frames, world = self.run.budget, self.config.uncertainty_frames, self.recipe.world(trainer)
-        after_s = self.recipe.tuning_s(world)
+        usual_s = {"tuning": self.recipe.tuning_s(world), "uncertainty": 0.0}
         if frames:
-            trial_s = uncertainty_seconds(world, self.parts.recording, frames)
-            after_s += min(budget.most_s("uncertainty"), 1.2 * trial_s)
-        return max(1e-6, took_s + budget.left_s - after_s)
+            usual_s["uncertainty"] = 1.2 * uncertainty_seconds(world, self.parts.recording, frames)
+        most_s = {"tuning": TUNING * budget.seconds, "uncertainty": budget.most_s("uncertainty")}
+        shares = {name: min(1.0, most_s[name] / max(usual, 1e-6)) for name, usual in usual_s.items()}
+        trainer.facts["shares"] = shares
+        return max(1e-6, took_s + budget.left_s - sum(shares[name] * usual for name, usual in usual_s.items()))
 
     def _finish(self) -> None:
         """Tunes and saves the trained world, then gives it an estimator and an uncertainty."""
@@ -91,9 +144,11 @@ class _Training:
         save_world(
             self.recipe.world(trainer), self.run.out / "world"
         )  # playable, should a kill come before the rest is done
-        tuned = self.recipe.tune(self.recipe.world(trainer))
+        shares = trainer.facts.get("shares", {"tuning": 1.0, "uncertainty": 1.0})
+        tuned = self.recipe.tune(self.recipe.world(trainer), shares["tuning"])
         world = self._save_with_strip()
-        settings = SensesConfig(config.estimator_steps, config.uncertainty_frames, config.seed)
+        frames = int(shares["uncertainty"] * config.uncertainty_frames)
+        settings = SensesConfig(config.estimator_steps, frames if frames >= FEWEST_FRAMES else 0, config.seed)
         sensing, facts = learn_senses(self.run, world, self.parts.recording, config.keep_out, settings)
         facts |= tuned
         save_world(sensing.replaced(card=facts), self.run.out / "world")
@@ -104,6 +159,9 @@ class _Training:
         with its memory and without."""
         world = self.recipe.world(self.trainer)
         worlds = (world, world.without_memory()) if self.parts.video.geometry else (world,)
-        draw_strip(worlds, self.parts.recording, self.run.out / f"strip-{self.trainer.steps_done:06d}.png")
+        strip = self.run.out / f"strip-{self.trainer.steps_done:06d}.png"
+        draw_strip(worlds, self.parts.recording, strip)
+        with replacing(self.run.out / "newest.png") as staged:
+            shutil.copyfile(strip, staged)
         save_world(world, self.run.out / "world")
         return world

@@ -20,6 +20,7 @@ from ..feeds import codec_feed, frames_feed
 from ..moves import CodecStatistics, frequent_moves, mosaics, overlay, palette
 from ..objectives.codec import CodecObjective, Spans
 from ..objectives.flow import Flow
+from ..objectives.fog import CLIPS as FOG_CLIPS
 from ..objectives.fog import choose_fog
 from ..objectives.scroll import learn_scroll
 from ..objectives.stress import FRAMES, USUAL, choose_stress
@@ -31,7 +32,8 @@ from .video_config import TrainConfig
 from .video_parts import VideoParts, flow_objective
 
 MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
-PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched
+PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
+QUARTER = 0.25
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE, MAX_STRESS = (
     0.4,
@@ -58,7 +60,8 @@ class CodecRecipe:
         plain = self.video.generator
         statistics = CodecStatistics.read(run.out, run.recipe)
         if statistics is None or statistics.over.shape != plain.size:
-            statistics = codec_statistics(recording, config.seed)
+            pixels = int(PAIR_PIXELS * min(1.0, max(config.hours / QUARTER, 1 / 16)))
+            statistics = codec_statistics(recording, config.seed, pixels)
             statistics.write(run.out, run.recipe)
         sizes = len(statistics.moves), len(statistics.palette)
         settings = CodecConfig(plain.size, plain.slots, plain.context, *sizes)
@@ -98,16 +101,19 @@ class CodecRecipe:
     def tuning_s(self, world: LearnedWorld) -> float:
         return 2 * dreaming_seconds(world, self.parts.recording, FRAMES)
 
-    def tune(self, world: LearnedWorld) -> dict:
-        """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
-        recorded episodes."""
-        objective = self.objective
-        assert isinstance(world.generator, Codec)
-        power = choose_stress(world, world.generator, self.parts.recording, objective.stress, self.parts.config.seed)
-        objective.smooth.module.stress.copy_(world.generator.stress)
-        scene = choose_fog(world, cast(FrameHistory, world.scene), self.parts.recording, self.parts.config.seed)
-        self.ground, self.fog_px = scene.ground, scene.config.fog_px
-        return {"taken_back": power, "fog_px": self.fog_px}
+
+def tune(self, world: LearnedWorld, share: float) -> dict:
+    """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
+    recorded episodes."""
+    objective = self.objective
+    assert isinstance(world.generator, Codec)
+    recording, frames = self.parts.recording, int(share * FRAMES)
+    power = choose_stress(world, world.generator, recording, objective.stress, self.parts.config.seed, frames)
+    objective.smooth.module.stress.copy_(world.generator.stress)
+    scene = cast(FrameHistory, world.scene)
+    scene = choose_fog(world, scene, recording, self.parts.config.seed, int(share * FOG_CLIPS))
+    self.ground, self.fog_px = scene.ground, scene.config.fog_px
+    return {"taken_back": power, "fog_px": self.fog_px}
 
 
 class FlatFlowRecipe:
@@ -132,7 +138,7 @@ class FlatFlowRecipe:
     def tuning_s(self, world: LearnedWorld) -> float:
         return 0.0
 
-    def tune(self, world: LearnedWorld) -> dict:
+    def tune(self, world: LearnedWorld, share: float) -> dict:
         return {}
 
 
@@ -155,14 +161,15 @@ def _flat_world(
     )
 
 
-def codec_statistics(recording: Recording, seed: int) -> CodecStatistics:
-    """The moves and colours of a recording, how rarely its pixels change, and what stays while it scrolls."""
+def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS) -> CodecStatistics:
+    """The moves and colours of a recording, how rarely its pixels change, and what stays while it scrolls. Moves are searched in
+    `pixels` of it."""
     rng = np.random.default_rng(seed)
     rows = recording.rows_within(1, 0)
     rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
     change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
-    most = max(32, PAIR_PIXELS // before[0, 0].numel())  # pairs: each is matched at 625 displacements
+    most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
     some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
     moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
     over = overlay(before, after, F.pad(moves, (0, 0, 1, 0)))

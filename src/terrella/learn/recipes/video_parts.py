@@ -28,7 +28,7 @@ class VideoRecipe(Protocol):
     """What differs between worlds with depth and poses and worlds of frames alone.
 
     preparations: the stages before the generator. world: a copy, on the CPU, of the world as it now is. tune: sets what is chosen
-    by rollouts of the trained world, and returns facts; tuning_s: the seconds that it will take, by a trial.
+    by a `share` of the usual rollouts of the trained world, and returns facts; tuning_s: seconds of the usual ones, by a trial.
     """
 
     @property
@@ -39,7 +39,7 @@ class VideoRecipe(Protocol):
     def preparations(self) -> Sequence[Stage]: ...
     def world(self, trainer: Trainer) -> LearnedWorld: ...
     def tuning_s(self, world: LearnedWorld) -> float: ...
-    def tune(self, world: LearnedWorld) -> dict: ...
+    def tune(self, world: LearnedWorld, share: float) -> dict: ...
 
 
 def flow_objective(video: VideoConfig, config: TrainConfig) -> Flow:

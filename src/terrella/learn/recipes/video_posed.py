@@ -87,7 +87,7 @@ class PosedRecipe:
     def tuning_s(self, world: LearnedWorld) -> float:
         return 0.0
 
-    def tune(self, world: LearnedWorld) -> dict:
+    def tune(self, world: LearnedWorld, share: float) -> dict:
         return {}
 
     def _first_rows(self) -> np.ndarray:
