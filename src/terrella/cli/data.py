@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..workflows.progress import stage
-from .say import Host, Json, Port, RecordingName, Token, result, say
+from .say import Host, Json, Port, RecordingName, Token, opened, result, say
 
 Fps = Annotated[float | None, arg(help="Frames per second of the new dataset. Default: those of the recording.")]
 Policy = Annotated[
@@ -168,7 +168,7 @@ def view(
     from ..serve.viewer import view as serve
 
     def ready(address: str) -> None:
-        result({"address": address, "dataset": folder}, json, f"{folder}: open {address}")
+        opened(folder, address, {"dataset": folder}, json)
 
     here = Path(folder).resolve() if "://" not in folder else Path.cwd() / folder.rstrip("/").rsplit("/", 1)[-1]
     serve(browse(folder, carry=repair), port, host, token, ready, out or here.with_name(f"{here.name}-good"))

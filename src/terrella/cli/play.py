@@ -9,7 +9,7 @@ from ..serve import ServeConfig
 from ..workflows import play as workflow
 from ..workflows import start
 from ..workflows.opening import ControlsConfig
-from .say import Host, Json, Port, Token, result, say
+from .say import Host, Json, Port, Token, opened, say
 
 AnyWorld = Annotated[Positional[str | None], arg(metavar="WORLD")]
 FirstSeed = Annotated[int | None, arg(help="Seed of the first episode. Default: one that begins with a good view.")]
@@ -33,11 +33,11 @@ def play(
     page = ServeConfig(host, port, token, seed)
 
     def begun(address: str) -> None:
-        result({"address": address}, json, f"Choose a world: open {address}")
+        opened("Choose a world", address, {}, json)
 
     def ready(address: str, worlds: list[World]) -> None:
         names = [world.spec.name for world in worlds]
-        result({"address": address, "worlds": names}, json, f"{' and '.join(names)}: open {address}")
+        opened(" and ".join(names), address, {"worlds": names}, json)
         if worlds[-1].spec.card.get("kind") == "splat":
             say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
 

@@ -3,9 +3,12 @@
 import json as json_text
 from collections.abc import Mapping
 from typing import Annotated
+from urllib.parse import urlsplit
 
 from tyro.conf import Positional, arg
 
+from ..serve.guard import is_loopback
+from ..serve.qr_code import qr_text
 from ..workflows.progress import Terminal
 from ..workflows.results import Result
 
@@ -36,6 +39,13 @@ say = Terminal()  # the progress of every command
 def show(result: Result, json: bool) -> None:
     """Prints the result of a workflow on stdout."""
     print(json_text.dumps(result.to_json(), indent=1, default=str) if json else result.summary(), flush=True)
+
+
+def opened(what: str, address: str, facts: Mapping[str, object], json: bool) -> None:
+    """Prints the address of a page, and for other devices of the network its QR code."""
+    elsewhere = not is_loopback(urlsplit(address).hostname or "")
+    code = qr_text(address) if elsewhere else ""
+    result({"address": address, **facts}, json, "\n".join(filter(None, [f"{what}: open {address}", code])))
 
 
 def result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:

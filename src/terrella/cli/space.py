@@ -17,7 +17,7 @@ from ..workflows.build_space import (
 from ..workflows.edit_space import EditSpaceConfig, edit_space
 from ..workflows.export_space import ExportSpaceConfig, export_space
 from ..workflows.splat_places import editable_place
-from .say import Host, Json, PlaceName, Port, RecordingName, Token, result, say, show
+from .say import Host, Json, PlaceName, Port, RecordingName, Token, opened, say, show
 
 
 def fit(
@@ -100,8 +100,7 @@ def view(
     place = editable_place(world, beside)
 
     def ready(address: str) -> None:
-        facts = {"address": address, "gaussians": len(place.scene.gaussians)}
-        result(facts, json, f"{place.scene.name}: open {address}")
+        opened(place.scene.name, address, {"gaussians": len(place.scene.gaussians)}, json)
 
     serve_place(place, port, host, token, ready)
 

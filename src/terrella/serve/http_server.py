@@ -78,8 +78,18 @@ def starting_command() -> str:
     return shlex.join(["terrella" if short else os.path.relpath(program), *given])
 
 
+def own_address() -> str:
+    """This machine's address in its network, which other devices can open; its name where it has no network. Nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # an address of documentation: only the route to it is looked up
+            return probe.getsockname()[0]
+        except OSError:
+            return socket.gethostname()
+
+
 def page_address(host: str, port: int, token: str | None) -> str:
-    shown = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    shown = own_address() if host in ("0.0.0.0", "::") else host
     shown = f"[{shown}]" if ":" in shown else shown
     return f"http://{shown}:{port}/" + (f"?token={token}" if token else "")
 

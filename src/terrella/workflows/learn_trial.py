@@ -25,7 +25,7 @@ class Pace:
     training: TrainingPace
 
     def steps_in(self, training_s: float) -> int:
-        """Training steps of a training of so many seconds."""
+        """Training steps of a training of `training_s` seconds."""
         return self.training.steps_in(training_s)
 
     def minutes_for(self, steps: int) -> int:

@@ -46,7 +46,7 @@ class TrainingPace(NamedTuple):
     share: float
 
     def steps_in(self, seconds: float) -> int:
-        """The steps for which a run of so many seconds has time."""
+        """The steps for which a run of `seconds` has time."""
         return max(0, int((seconds * self.share - self.setup_s) / self.step_s))
 
 
