@@ -230,8 +230,8 @@ class _Learning:
     def _train(self, report: Report) -> dict[str, object]:
         folder = self.schedule.folder
         hours = self.schedule.share_s[TRAINING] / 3600
-        every = {"save_every_s": SAVE_EVERY_S, "strip_every_s": self._strip_s}
-        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, **every)
+        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
+        config = replace(config, strip_every_s=self._strip_s)
         facts = train_video(folder / RECORDING, folder / "run", config, report)
         return {"world": facts["world"], "steps": facts["step"]}
 

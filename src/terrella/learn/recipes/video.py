@@ -148,7 +148,8 @@ class _Training:
         tuned = self.recipe.tune(self.recipe.world(trainer), shares["tuning"])
         world = self._save_with_strip()
         frames = int(shares["uncertainty"] * config.uncertainty_frames)
-        settings = SensesConfig(config.estimator_steps, frames if frames >= FEWEST_FRAMES else 0, config.seed)
+        fewest = min(FEWEST_FRAMES, config.uncertainty_frames)
+        settings = SensesConfig(config.estimator_steps, frames if frames >= fewest else 0, config.seed)
         sensing, facts = learn_senses(self.run, world, self.parts.recording, config.keep_out, settings)
         facts |= tuned
         save_world(sensing.replaced(card=facts), self.run.out / "world")
