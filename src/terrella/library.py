@@ -23,6 +23,21 @@ if TYPE_CHECKING:
 
 BUNDLED = Path(__file__).parent / "bundled"
 GAME = "doom:my_way_home"
+# games and environments to begin with: the packages that each needs, the command that installs them, and what it is
+GAMES: dict[str, tuple[tuple[str, ...], str, str]] = {
+    GAME: (("vizdoom",), "pip install 'terrella[sim]'", "ViZDoom with Freedoom's art: the game that doom-maze learned"),
+    "gym:Islet-v0": ((), "", "a walk over an island, a small game of our own"),
+    "gym:CartPole-v1": (("pygame",), "pip install 'terrella[sim]'", "any Gymnasium environment, by its id"),
+    "gym:ALE/Pong-v5": (("ale_py",), "pip install 'terrella[atari]'", "any Atari game, by its id"),
+    "mujoco:arm": (
+        ("mujoco",), "pip install 'terrella[mujoco]'",
+        "an arm; also car, drone, ant, humanoid, or any MJCF or URDF: mujoco:FILE.xml",
+    ),
+    "mujoco:go1": (
+        ("mujoco", "mjlab"), "pip install 'terrella[mujoco]' && pip install --no-deps mjlab==1.6.0",
+        "a quadruped; also g1 and yam",
+    ),
+}  # fmt: skip
 
 
 class Entry(NamedTuple):
@@ -157,10 +172,7 @@ def folder_of(name: str | Path) -> Path:
     if (BUNDLED / text / "world.json").is_file():
         return BUNDLED / text
     if Path(text).exists():
-        runs = (
-            Path(text) / "world",
-            Path(text) / "run" / "world",
-        )  # where `terrella train` and `terrella learn` leave the world
+        runs = Path(text) / "world", Path(text) / "run" / "world"  # of `terrella train`, and of `terrella learn`
         if (Path(text) / "learn.json").is_file() and not (runs[1] / "world.json").is_file():
             raise TerrellaError(f"{text} has no world yet: `learn` saves the first one soon after its training begins.")
         return next((run for run in runs if (run / "world.json").is_file()), Path(text))
@@ -182,16 +194,16 @@ def folder_for_keys(name: str | Path) -> Path | None:
     return folder if os.access(folder, os.W_OK) and os.access(folder / "world.json", os.W_OK) else None
 
 
+def not_installed() -> dict[str, str]:
+    """The games for which a package is missing, and the command that installs it."""
+    return {name: install for name, (packages, install, _) in GAMES.items() if not all(map(find_spec, packages))}
+
+
 def worlds(folders: Sequence[str | Path] = ()) -> list[Entry]:
     """The bundled worlds, the real games that are installed, and the checkpoints in or directly below `folders`."""
     entries = [Entry(name, "bundled", _read_card(BUNDLED / name)) for name in sorted(_bundled())]
-    if find_spec("vizdoom"):
-        entries.append(Entry(GAME, "game", {"what": "ViZDoom with Freedoom's art: the game that doom-maze learned"}))
-    entries.append(Entry("gym:Islet-v0", "game", {"what": "a walk over an island, a small game of our own"}))
-    entries.append(Entry("gym:CartPole-v1", "game", {"what": "any Gymnasium environment, by its id"}))
-    if find_spec("mujoco"):
-        what = "a quadruped; also g1, yam, ant, humanoid, hopper, reacher, or any MJCF or URDF: mujoco:FILE.xml"
-        entries.append(Entry("mujoco:go1", "game", {"what": what}))
+    absent = not_installed()
+    entries += [Entry(name, "game", {"what": what}) for name, (_, _, what) in GAMES.items() if name not in absent]
     for folder in map(Path, folders):
         if not folder.is_dir():
             raise TerrellaError(f"{folder} is not a folder; give one that holds checkpoints (each has a world.json).")

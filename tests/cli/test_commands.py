@@ -381,6 +381,17 @@ def test_list_shows_checkpoints_with_their_cards(capsys, tmp_path):
     assert "steps: 12" in capsys.readouterr().out
 
 
+def test_list_offers_what_is_installed_and_says_how_to_install_the_rest(capsys, monkeypatch):
+    there = terrella.library.find_spec
+    monkeypatch.setattr("terrella.library.find_spec", lambda name: None if name in ("ale_py", "mjlab") else there(name))
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert not any(line.startswith(("mujoco:go1", "gym:ALE/Pong-v5")) for line in lines)
+    assert "not installed: gym:ALE/Pong-v5: pip install 'terrella[atari]'" in lines
+    assert any(line.startswith("not installed: mujoco:go1: ") and "mjlab" in line for line in lines)
+    assert lines[-1].startswith("next: terrella play ")
+
+
 def test_record_then_look(capsys, tmp_path):
     arguments = ["record", "world", "gym:CartPole-v1", "--out", str(tmp_path / "set"), "--frames", "40", "--json"]
     assert main(arguments) == 0

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..workflows.progress import stage
+from ..workflows.results import command, folder_name
 from .say import Host, Json, Port, RecordingName, Token, opened, result, say
 
 Fps = Annotated[float | None, arg(help="Frames per second of the new dataset. Default: those of the recording.")]
@@ -66,7 +67,8 @@ def doctor(
             done = mend(folder, target, progress=lambda pieces, of: report(pieces, of), allow_loss=yes or allowed)
         facts |= {"mended": str(target), "done": done}
         lines += [*done, f"the mended copy: {target}"]
-    result(facts, json, "\n".join(lines))
+    following = command("terrella", "data", "doctor", folder, repair=True) if diagnosis.faults and not repair else ""
+    result(facts, json, "\n".join(lines), following)
     return 1 if diagnosis.faults and not repair else 0
 
 
@@ -109,9 +111,9 @@ def convert(
         to = None if config.to == "auto" else config.to
         left_out = write_source(recording, target, to, rows, lambda done, of: report(done, of))
     facts = {"source": str(source), "target": str(target), "sensors": sorted(recording.sensors), "left_out": left_out}
-    result(
-        facts, json, "\n".join([*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"])
-    )
+    lines = [*(f"left out or changed: {what}" for what in left_out), f"{source} is now {target}"]
+    checking = command("terrella", "data", "doctor", target) if (target / "meta" / "info.json").is_file() else ""
+    result(facts, json, "\n".join(lines), checking)
 
 
 def merge(
@@ -137,7 +139,8 @@ def merge(
     recordings = {path: open_source(path) for path in sources}
     with _whole_or_nothing(out), stage("merging", say) as report:
         facts, text = merge_into(recordings, out.resolve(), mapping, fps, dry, lambda done, of: report(done, of))
-    result(facts, json, text)
+    following = command("terrella", "data", "doctor", out)
+    result(facts, json, text, "" if dry else following)
 
 
 def view(
@@ -204,4 +207,5 @@ def label(
         facts = {**labels.facts, "notes": write_source(labels.source, out, "lerobot", LeRobotRows(pictures=pictures))}
     if keys:
         facts |= {"key_accuracy": keys.accuracy, "commonest_action": keys.commonest, "labelled_frames": keys.used}
-    result({"dataset": str(out), **facts}, json)
+    following = command("terrella", "train", "video", out, out=f"runs/{folder_name(out.name)}")
+    result({"dataset": str(out), **facts}, json, following=following)

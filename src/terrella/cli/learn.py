@@ -9,6 +9,7 @@ from ..workflows import learn as world_workflow
 from ..workflows import practise as policy_workflow
 from ..workflows.learn import LearnConfig
 from ..workflows.opening import ControlsConfig
+from ..workflows.results import command
 from .say import Json, say, show
 
 
@@ -31,4 +32,5 @@ def learn(
     if config.controls != ControlsConfig():
         raise TerrellaError("--keys, --action-names and --idle are for a person who plays; --practise takes none.")
     rounds = policy_workflow.PractiseConfig(config.minutes, config.out, config.frames, config.seed, config.environment)
-    show(policy_workflow.practise(name, rounds, progress=say), json)
+    practised = policy_workflow.practise(name, rounds, progress=say)
+    show(practised, json, command("terrella", "play", practised.world, agent=practised.policy))

@@ -1,13 +1,14 @@
 """The commands `terrella record ...`."""
 
-from ..workflows.collect import CollectConfig, DoomRecordConfig, collect, collect_doom
+from ..workflows.collect import CollectConfig, CollectResult, DoomRecordConfig, collect, collect_doom
 from ..workflows.recording_facts import describe as described  # noqa: F401  its former name and place
+from ..workflows.results import command, folder_name
 from .say import Json, WorldName, say, show
 
 
 def record_doom(config: DoomRecordConfig, json: Json = False) -> None:
     """Record the game Doom: pictures, depth, camera pose, actions and rewards."""
-    show(collect_doom(config, progress=say), json)
+    show(recorded := collect_doom(config, progress=say), json, _training(recorded))
 
 
 def record_world(name: WorldName, config: CollectConfig, json: Json = False) -> None:
@@ -16,4 +17,10 @@ def record_world(name: WorldName, config: CollectConfig, json: Json = False) -> 
     Args:
         name: The environment (gym:ID), a name of `terrella list`, or the path of a checkpoint or run.
     """
-    show(collect(name, config, progress=say), json)
+    show(recorded := collect(name, config, progress=say), json, _training(recorded))
+
+
+def _training(recorded: CollectResult) -> str:
+    """The command that trains a world on a recording: of pictures where it has any."""
+    kind = "video" if "look" in recorded.facts else "latent"
+    return command("terrella", "train", kind, recorded.dataset, out=f"runs/{folder_name(recorded.dataset.name)}")

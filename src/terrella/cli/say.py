@@ -36,9 +36,9 @@ Token = Annotated[
 say = Terminal()  # the progress of every command
 
 
-def show(result: Result, json: bool) -> None:
-    """Prints the result of a workflow on stdout."""
-    print(json_text.dumps(result.to_json(), indent=1, default=str) if json else result.summary(), flush=True)
+def show(workflow: Result, json: bool, following: str = "") -> None:
+    """Prints the result of a workflow on stdout, with the command that usually follows."""
+    result({} if not json else workflow.to_json(), json, None if json else workflow.summary(), following)
 
 
 def opened(what: str, address: str, facts: Mapping[str, object], json: bool) -> None:
@@ -48,7 +48,11 @@ def opened(what: str, address: str, facts: Mapping[str, object], json: bool) -> 
     result({"address": address, **facts}, json, "\n".join(filter(None, [f"{what}: open {address}", code])))
 
 
-def result(facts: Mapping[str, object], json: bool, text: str | None = None) -> None:
-    """One JSON document, or the same for people, on stdout."""
-    shown = json_text.dumps(facts, indent=1, default=str) if json else text
-    print(shown or "\n".join(f"{name}: {value}" for name, value in facts.items()), flush=True)
+def result(facts: Mapping[str, object], json: bool, text: str | None = None, following: str = "") -> None:
+    """One JSON document, or the same for people, on stdout, with the command that usually follows."""
+    after = {"next": following} if following else {}
+    if json:
+        print(json_text.dumps({**facts, **after}, indent=1, default=str), flush=True)
+        return
+    lines = [text] if text else [f"{name}: {value}" for name, value in facts.items()]
+    print("\n".join([*lines, *(f"{name}: {value}" for name, value in after.items())]), flush=True)

@@ -1,6 +1,7 @@
 """The command `terrella score`."""
 
 from ..workflows import score as workflow
+from ..workflows.results import command
 from .say import Json, WorldName, say, show
 
 
@@ -12,4 +13,4 @@ def score(name: WorldName, config: workflow.ScoreConfig, json: Json = False) -> 
     Args:
         name: A name of `terrella list`, or the path of a checkpoint or run.
     """
-    show(workflow.score(name, config, progress=say), json)
+    show(workflow.score(name, config, progress=say), json, command("terrella", "play", name))

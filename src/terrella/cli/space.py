@@ -16,6 +16,7 @@ from ..workflows.build_space import (
 )
 from ..workflows.edit_space import EditSpaceConfig, edit_space
 from ..workflows.export_space import ExportSpaceConfig, export_space
+from ..workflows.results import command
 from ..workflows.splat_places import editable_place
 from .say import Host, Json, PlaceName, Port, RecordingName, Token, opened, say, show
 
@@ -31,7 +32,7 @@ def fit(
         out: Folder of the run; the world is saved in OUT/world.
         watch: Show the place on a page meanwhile, sharper every few seconds.
     """
-    show(fit_space(data, out, config, watch_port=port if watch else None, progress=say), json)
+    show(fit_space(data, out, config, watch_port=port if watch else None, progress=say), json, _viewing(out))
 
 
 def build(
@@ -48,7 +49,7 @@ def build(
         source: Words ("a long room with two pillars and a red door"), or the layout.json, .glb or .gltf.
         out: Folder of the world.
     """
-    show(build_space(source, out, config), json)
+    show(build_space(source, out, config), json, _viewing(out))
 
 
 def import_(
@@ -61,7 +62,7 @@ def import_(
         file: The file; for an unpacked .sog its folder.
         out: Folder of the world.
     """
-    show(import_space(file, out, config), json)
+    show(import_space(file, out, config), json, _viewing(out))
 
 
 def export(
@@ -111,4 +112,8 @@ def edit(world: PlaceName, config: EditSpaceConfig, json: Json = False) -> None:
     Args:
         world: The folder of the world, or the run that made it.
     """
-    show(edit_space(world, config, progress=say), json)
+    show(edit_space(world, config, progress=say), json, _viewing(world))
+
+
+def _viewing(place: str | Path) -> str:
+    return command("terrella", "space", "view", place)

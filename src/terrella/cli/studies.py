@@ -1,5 +1,6 @@
 """The commands `plan`, `evaluate`, `transfer` and `bench acceleration`."""
 
+from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
@@ -9,6 +10,7 @@ from ..workflows.evaluate import EvaluateConfig
 from ..workflows.evaluate import evaluate as run_evaluate
 from ..workflows.plan import plan as run_plan
 from ..workflows.plan_study import PlanConfig
+from ..workflows.results import command
 from ..workflows.transfer import TransferConfig
 from ..workflows.transfer import transfer as run_transfer
 from .say import Json, WorldName, say, show
@@ -35,7 +37,8 @@ def plan(world: WorldName, config: PlanConfig, json: Json = False) -> int:
         world: The world to plan in: a name of `terrella list`, the path of a checkpoint, or a simulator (gym:CartPole-v1).
     """
     outcome = run_plan(world, config, progress=say)
-    show(outcome, json)
+    following = command("terrella", "evaluate", "plan", real=config.real, **{"in": world})
+    show(outcome, json, following)
     return STOPPED if outcome.stopped else 0
 
 
@@ -44,7 +47,8 @@ def evaluate(policies: Policies, inside: Inside, config: EvaluateConfig, json: J
 
     A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
     """
-    show(run_evaluate(policies, inside, config, progress=say), json)
+    agent = next((name for name in policies if Path(name).is_dir()), None)
+    show(run_evaluate(policies, inside, config, progress=say), json, command("terrella", "play", inside, agent=agent))
 
 
 def transfer(config: TransferConfig, json: Json = False) -> None:
@@ -53,7 +57,7 @@ def transfer(config: TransferConfig, json: Json = False) -> None:
     The methods are domain randomisation, system identification, and a model that is fitted to a few real episodes. A folder
     receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
     """
-    show(run_transfer(config, progress=say), json)
+    show(run_transfer(config, progress=say), json, command("terrella", "play", config.sim))
 
 
 def acceleration(world: WorldName, config: AccelerationConfig, json: Json = False) -> None:
@@ -65,4 +69,5 @@ def acceleration(world: WorldName, config: AccelerationConfig, json: Json = Fals
     Args:
         world: A learned world, or a simulator: a name of `terrella list`, or a path.
     """
-    show(measure_acceleration(world, config, progress=say), json)
+    following = command("terrella", "train", "policy", out="runs/policy", **{"in": world})
+    show(measure_acceleration(world, config, progress=say), json, following)

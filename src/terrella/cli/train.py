@@ -22,6 +22,7 @@ from ..learn.trainer import device_named
 from ..library import folder_of
 from ..workflows.opening import Device, load_named
 from ..workflows.progress import Report
+from ..workflows.results import command
 from ..workflows.train import run_recipe, train_latent, train_video
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
@@ -35,7 +36,7 @@ def video(data: RecordingName, out: str, config: TrainConfig, json: Json = False
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
-    show(train_video(data, out, config, progress=say), json)
+    show(train_video(data, out, config, progress=say), json, command("terrella", "score", out, data=data, quick=True))
 
 
 def latent(data: RecordingName, out: str, config: LatentTraining, json: Json = False) -> None:
@@ -46,7 +47,8 @@ def latent(data: RecordingName, out: str, config: LatentTraining, json: Json = F
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, validation.json, and pictures of truth and prediction.
     """
-    show(train_latent(data, out, config, progress=say), json)
+    following = command("terrella", "train", "policy", out=f"{out.rstrip('/')}-policy", **{"in": out, "from": data})
+    show(train_latent(data, out, config, progress=say), json, following)
 
 
 def goals(
@@ -88,7 +90,7 @@ def uncertainty(name: WorldName, data: str, out: str, config: SensesConfig, json
         data: The recording that it was trained on.
         out: Folder of the run; the world is in OUT/world.
     """
-    _shown(lambda report: train_uncertainty(folder_of(name), data, out, config, report), json)
+    _shown(lambda report: train_uncertainty(folder_of(name), data, out, config, report), json, _playing(out))
 
 
 def objects(name: WorldName, data: str, out: str, config: ObjectsTraining, json: Json = False) -> None:
@@ -99,7 +101,7 @@ def objects(name: WorldName, data: str, out: str, config: ObjectsTraining, json:
         data: A recording of the same game with the identity of each object.
         out: Folder of the run; the world is in OUT/world.
     """
-    _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json)
+    _shown(lambda report: train_objects(folder_of(name), data, out, config, report), json, _playing(out))
 
 
 def latent_actions(data: RecordingName, out: str, config: LatentActionsConfig, json: Json = False) -> None:
@@ -109,7 +111,8 @@ def latent_actions(data: RecordingName, out: str, config: LatentActionsConfig, j
         data: The recording: a folder, or an address. Its own actions, if it has any, are not used.
         out: Folder of the run: checkpoint, log, and pictures of true, inferred and random actions.
     """
-    _shown(lambda report: train_latent_actions(data, out, config, report), json)
+    following = command("terrella", "data", "label", out, data, out=f"{data.rstrip('/')}-labelled")
+    _shown(lambda report: train_latent_actions(data, out, config, report), json, following)
 
 
 def few_steps(
@@ -127,7 +130,7 @@ def few_steps(
         data: A recording of the same game.
         out: Folder of the run: the world, a log, and pictures of truth and prediction.
     """
-    _shown(lambda report: distil(_learned(name, device), data, out, config, report), json, run=out)
+    _shown(lambda report: distil(_learned(name, device), data, out, config, report), json, _playing(out), run=out)
 
 
 def dreams(
@@ -149,11 +152,20 @@ def dreams(
             distribution.
     """
     master = None if teacher is None else _learned(teacher, device)
-    _shown(lambda report: train_dreams(_learned(name, device), data, out, config, report, master), json, run=out)
+    _shown(
+        lambda report: train_dreams(_learned(name, device), data, out, config, report, master),
+        json,
+        _playing(out),
+        run=out,
+    )
 
 
-def _shown(recipe: Callable[[Report], dict], json: bool, **facts: str) -> None:
-    show(run_recipe(recipe, say, **facts), json)
+def _shown(recipe: Callable[[Report], dict], json: bool, following: str = "", **facts: str) -> None:
+    show(run_recipe(recipe, say, **facts), json, following)
+
+
+def _playing(out: str) -> str:
+    return command("terrella", "play", out)
 
 
 def _learned(name: str, device: str) -> LearnedWorld:

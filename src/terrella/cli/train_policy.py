@@ -4,6 +4,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from ..workflows.results import command
 from ..workflows.train_policy import TrainPolicyConfig, train_policy
 from .say import Json, say, show
 
@@ -15,4 +16,8 @@ def policy(world: Annotated[str, arg(name="in")], config: TrainPolicyConfig, jso
     Args:
         world: The world to practise in: a name of `terrella list`, the path of a checkpoint or run, or a simulator (gym:ID).
     """
-    show(train_policy(world, config, progress=say), json)
+    show(
+        trained := train_policy(world, config, progress=say),
+        json,
+        command("terrella", "play", world, agent=trained.folder),
+    )

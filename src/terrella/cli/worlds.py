@@ -27,6 +27,9 @@ def list_worlds(
         print(f"{entry.name}  [{entry.source}]")
         for fact, value in entry.card.items():
             print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
+    for name, install in library.not_installed().items():
+        print(f"not installed: {name}: {install}")
+    print(f"next: terrella play {entries[0].name}")
 
 
 def convert_world(

@@ -53,11 +53,14 @@ class TrainPolicyResult:
     facts: Mapping[str, Any]  # Of the training run: policy (its folder), practised_steps, minutes, losses.
     trial: PolicyTrial | None  # None without a real environment.
 
+    @property
+    def folder(self) -> Path:
+        """The folder of the policy."""
+        return Path(self.facts["policy"])
+
     def to_json(self) -> dict[str, Any]:
         if self.trial is None:
-            out = Path(self.facts["policy"]).parent
-            hint = f"terrella train policy --in {self.world} --out {out} --real ENVIRONMENT tries it there"
-            return jsonable({**self.facts, "play": hint})
+            return jsonable(self.facts)
         return jsonable({**self.trial.to_json(), **self.facts})
 
     def summary(self) -> str:
