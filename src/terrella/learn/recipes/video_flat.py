@@ -102,7 +102,7 @@ class CodecRecipe:
         return 2 * dreaming_seconds(world, self.parts.recording, FRAMES)
 
 
-def tune(self, world: LearnedWorld, share: float) -> dict:
+    def tune(self, world: LearnedWorld, share: float) -> dict:
     """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
     recorded episodes."""
     objective = self.objective
