@@ -110,7 +110,7 @@ def score(world: str | Path, config: ScoreConfig, *, progress: Progress = silent
     request = ExamRequest(arms, closing, config.data, config.new, config.fresh, clips, drift, config.seed)
     exam, identity = exam_of(request, exam_config, progress)
     if config.quick and config.clips is None:
-        exam = exam.of(most_clips_within(exam, QUICK_S, range(2, QUICK_CLIPS + 1)))
+        exam = exam.of(most_clips_within(exam, QUICK_S, range(2, QUICK_CLIPS + 1)) or 2)
     identity += f" fast={config.fast} device={device_of(config.device)}"
     with stage("scoring", progress) as report:
         card, files = write_card(name, exam, identity, Path(config.out), report)

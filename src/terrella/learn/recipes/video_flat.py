@@ -101,19 +101,18 @@ class CodecRecipe:
     def tuning_s(self, world: LearnedWorld) -> float:
         return 2 * dreaming_seconds(world, self.parts.recording, FRAMES)
 
-
     def tune(self, world: LearnedWorld, share: float) -> dict:
-    """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
-    recorded episodes."""
-    objective = self.objective
-    assert isinstance(world.generator, Codec)
-    recording, frames = self.parts.recording, int(share * FRAMES)
-    power = choose_stress(world, world.generator, recording, objective.stress, self.parts.config.seed, frames)
-    objective.smooth.module.stress.copy_(world.generator.stress)
-    scene = cast(FrameHistory, world.scene)
-    scene = choose_fog(world, scene, recording, self.parts.config.seed, int(share * FOG_CLIPS))
-    self.ground, self.fog_px = scene.ground, scene.config.fog_px
-    return {"taken_back": power, "fog_px": self.fog_px}
+        """How much the draw favours change, and whether the ground of the recordings is its memory, is chosen by rollouts of
+        recorded episodes."""
+        objective = self.objective
+        assert isinstance(world.generator, Codec)
+        recording, frames = self.parts.recording, int(share * FRAMES)
+        power = choose_stress(world, world.generator, recording, objective.stress, self.parts.config.seed, frames)
+        objective.smooth.module.stress.copy_(world.generator.stress)
+        scene = cast(FrameHistory, world.scene)
+        scene = choose_fog(world, scene, recording, self.parts.config.seed, int(share * FOG_CLIPS))
+        self.ground, self.fog_px = scene.ground, scene.config.fog_px
+        return {"taken_back": power, "fog_px": self.fog_px}
 
 
 class FlatFlowRecipe:
