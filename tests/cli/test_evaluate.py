@@ -65,6 +65,7 @@ def test_one_policy_in_a_world_alone(capsys, tmp_path):
         (["constant:7"], "takes actions in"),
         (["idle", "--real", "gym:CartPole-v1"], "they differ"),
         (["idle", "--success", "won"], "no channel 'won'"),
+        (["idle", "--success", "done", "--within", "0.2"], "leave --within out"),
         (["idle", "--episodes", "0"], "whole numbers from 1 up"),
         (["idle", "--goal", "99"], "can never be reached"),
         (["idle", "--goal", "5", "--within", "3"], "already solved"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from copy import copy
+from dataclasses import replace
 
 import pytest
 from tests.cli.tiny import NAME
@@ -10,6 +12,11 @@ from tests.cli.tiny import NAME
 import terrella
 from terrella.act.planning import Planner
 from terrella.cli import main
+from terrella.core.errors import TerrellaError
+from terrella.sim.randomised import Randomised
+from terrella.workflows.opening import EnvironmentConfig
+from terrella.workflows.plan_study import open_study
+from terrella.workflows.real_environment import open_copied, open_real, refuse_randomised
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
 QUICK = ["--episodes", "4", "--steps", "24", "--samples", "6", "--iterations", "2", "--horizon", "4", "--json"]
@@ -63,6 +70,10 @@ def test_reality_and_dream_are_filmed(capsys, tmp_path):
         (["--samples", "1"], "samples must be 2 or more"),
         (["--agent", "random", "--proposal", "random", "--budget-ms", "5"], "leave --proposal, --budget-ms out"),
         (["--goal", "reward", "--cost", "last"], "leave --cost out"),
+        (["--goal", "reward", "--within", "0.1"], "leave --within out"),
+        (["--goal", "5", "--success", "done", "--within", "0.1"], "leave --within out"),
+        (["--goal", "5", "--apart", "2"], "leave --apart out"),
+        (["--real", BLIND, "--randomise", "no-such.toml"], "no-such.toml"),
     ],
 )
 def test_what_cannot_be_planned_is_said_in_a_sentence(capsys, tmp_path, words, said):
@@ -113,6 +124,38 @@ def test_an_end_that_is_all_that_counts_is_gone_to_before_the_next_plan(capsys, 
     assert planned(capsys, *words, "--out", str(tmp_path / "c"))["replan"] == 1
 
 
+def test_the_verdict_in_words_is_the_first_line(capsys, tmp_path):
+    words = ["plan", BLIND, *QUICK[:4], "--no-curve", "--out", str(tmp_path)]
+    assert main([*words, "--goal", "20", "--within", "0.001", "--agent", "random", "--steps", "8"]) == 0
+    first, *_, last = capsys.readouterr().out.splitlines()
+    assert first == "The policy random is not seen to do better than random actions; more --episodes may tell."
+    assert last == f"next: terrella evaluate plan --in {BLIND}"
+
+
+def test_an_agent_needs_no_reward_where_a_channel_says_what_success_is(tmp_path, monkeypatch):
+    def without_reward(name, environment):
+        world = copy(open_copied(name, environment))
+        shown = {channel: space for channel, space in world.spec.channels.items() if channel != "reward"}
+        world.spec = replace(world.spec, channels=shown)
+        return world
+
+    monkeypatch.setattr("terrella.workflows.plan_study.open_copied", without_reward)
+    config = terrella.PlanConfig(agent="constant:2", success="done", episodes=2, steps=70, out=tmp_path)
+    assert open_study(BLIND, config, print).criterion.channel == "done"
+    with pytest.raises(TerrellaError, match="no reward"):
+        open_study(BLIND, replace(config, agent=None), print)
+
+
+def test_the_real_environment_is_never_randomised(tmp_path):
+    ranges = tmp_path / "ranges.toml"
+    ranges.write_text('"body_mass" = {uniform = [0.5, 2.0], scale = true}\n')
+    environment = EnvironmentConfig(randomise=str(ranges))
+    opened = open_real(BLIND, environment, EnvironmentConfig().open(BLIND).spec)
+    assert not isinstance(opened, Randomised)
+    with pytest.raises(TerrellaError, match="was learned and is as it is"):
+        refuse_randomised("doom-maze", environment)
+
+
 def test_a_plan_that_is_stopped_keeps_the_episodes_that_are_done(capsys, tmp_path, monkeypatch):
     act, calls = Planner.act, []
 
@@ -144,6 +187,11 @@ def test_planning_from_python(tmp_path):
     config = terrella.PlanConfig("observation=20", within=0.001, search=search, episodes=2, steps=24, out=tmp_path)
     result = terrella.plan(BLIND, config, progress=lines.append)
     assert result.planner["success"].value == 1 and len(result.episodes) == 2 and result.page.is_file()
-    assert result.summary().startswith("reached in 100%") and result.settings["replan"] == 1
+    verdict, reached = result.summary().splitlines()[:2]
+    assert (
+        verdict.startswith("Planning in this world ")
+        and reached.startswith("reached in 100%")
+        and result.settings["replan"] == 1
+    )
     assert "No film: the environment shows no pictures." in lines
     json.dumps(result.to_json(), allow_nan=False)

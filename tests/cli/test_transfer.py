@@ -95,6 +95,12 @@ def test_what_is_no_pair_is_refused_in_a_sentence(tmp_path, capsys, words, why):
     assert code == 2 and why in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize("words", [("--episodes", "5"), ("--seeds", "2"), ("--workers", "2"), ("--practice", "3")])
+def test_what_a_recording_has_no_use_for_is_named(tmp_path, capsys, words):
+    code, _, err = ran(capsys, "transfer", "--real", tmp_path, *words, "--out", tmp_path / "t")
+    assert code == 2 and f"has no use for {words[0]}" in err and err.count("\n") == 1
+
+
 HOLD = '<custom><text name="terrella.task" data="hold"/><numeric name="terrella.within" data="0.1"/></custom>'
 
 

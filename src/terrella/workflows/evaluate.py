@@ -21,7 +21,7 @@ from .evaluation_log import EvaluationLog, crc_of, fingerprint
 from .goals import REWARD, read_goal
 from .opening import Device, EnvironmentConfig, device_of, load_named
 from .progress import Progress, silent, stage
-from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real
+from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 from .results import folder_name, jsonable, table_lines
 
 
@@ -166,6 +166,7 @@ def labels_of(names: tuple[str, ...]) -> dict[str, str]:
 
 def _open(name: str, config: EvaluateConfig, progress: Progress) -> _Study:
     """The worlds by their names, held to each other. TerrellaError for what does not fit."""
+    refuse_randomised(name, config.environment)
     if library.is_truth(name):
         dream = _simulator(name, config.environment)
     else:
@@ -192,6 +193,8 @@ def _open(name: str, config: EvaluateConfig, progress: Progress) -> _Study:
 
 def _criterion(config: EvaluateConfig, goal: Mapping[str, Any], dream: Spec, real: World | None) -> SuccessCriterion:
     if config.success:
+        if config.within != EvaluateConfig.within:
+            raise TerrellaError(f"--success {config.success} says when an episode has succeeded; leave --within out.")
         for spec in (dream, *([real.spec] if real else [])):
             if config.success not in spec.channels:
                 known = ", ".join(spec.channels)

@@ -62,6 +62,8 @@ def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResu
         if getattr(config, field.name) != field.default and suffix not in OPTIONS[field.name]:
             kinds = " and ".join(OPTIONS[field.name])
             raise TerrellaError(f"--{field.name} is for {kinds} files; leave it out for {file.name}.")
+    if suffix == ".glb" and config.kind != "mesh" and config.cell != ExportSpaceConfig.cell:
+        raise TerrellaError(f"--cell is for a .glb of --kind mesh; leave it out for --kind {config.kind}.")
     if suffix == ".html":
         scene = unedited_scene(world)
         content, facts = PlacePage(scene).html(read_edits(folder_of(world))), {"gaussians": len(scene.gaussians)}

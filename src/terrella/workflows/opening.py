@@ -50,7 +50,7 @@ class EnvironmentConfig:
     adapter: str | None = None
     """A Python file (FILE.py or FILE.py:NAME) with an Adapter that finds depth, poses and more."""
     randomise: str | None = None
-    """A TOML or JSON file of distributions, from which each episode draws masses, friction, delay and more."""
+    """A TOML or JSON file of distributions, from which each episode of a simulator draws masses, friction, delay and more."""
 
     def open(self, name: str, forkable: bool = False, rgb: bool = True) -> World:
         """The world of this name with these settings. `forkable`: its states can be copied, or TerrellaError. `rgb`: it

@@ -55,7 +55,8 @@ def save_result(study: PlanStudy, played: PlannedEpisodes, settings: Mapping[str
     seed, episodes = study.config.seed, played.planner.episodes
     planner, random = figures_of(played.planner, seed), {} if played.random is None else figures_of(played.random, seed)
     measure = "success" if "success" in planner else "return"
-    lines = _lines(study, played, planner, random)
+    difference = None if played.random is None else gain(played.planner, played.random, measure, seed)
+    lines = [*_verdict(study, difference), *_lines(study, played, planner, random)]
     folder.mkdir(parents=True, exist_ok=True)
     seen = None if played.stopped else next((one for one in episodes if one.seen), None)
     divergence, strip, name = ({}, None, "") if seen is None else _film(study, seen, folder)
@@ -69,7 +70,7 @@ def save_result(study: PlanStudy, played: PlannedEpisodes, settings: Mapping[str
         settings=settings,
         planner=planner,
         random=random,
-        difference={} if played.random is None else {measure: gain(played.planner, played.random, measure, seed)},
+        difference={} if difference is None else {measure: difference},
         curve=played.curve,
         episodes=tuple(episodes),
         divergence=divergence,
@@ -80,6 +81,18 @@ def save_result(study: PlanStudy, played: PlannedEpisodes, settings: Mapping[str
     facts = {**result.to_json(), "divergence": divergence, "played": [_episode(episode) for episode in episodes]}
     write_json(folder / "plan.json", jsonable(facts))
     return result
+
+
+def _verdict(study: PlanStudy, difference: Figure | None) -> list[str]:
+    """One sentence: better than random actions from the same starts, worse, or neither for certain."""
+    if difference is None:
+        return []
+    who = f"The policy {study.config.agent}" if study.config.agent else "Planning in this world"
+    if difference.low > 0:
+        return [f"{who} does better than random actions."]
+    if difference.high < 0:
+        return [f"{who} does worse than random actions."]
+    return [f"{who} is not seen to do better than random actions; more --episodes may tell."]
 
 
 def _lines(

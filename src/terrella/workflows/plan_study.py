@@ -35,7 +35,7 @@ from .goals import REWARD, read_goal
 from .opening import Device, EnvironmentConfig, device_of, load_named
 from .place_goals import WALK_S, PlaceGoals, is_recording, views_of, walking_defaults
 from .progress import Progress, stage
-from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real
+from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 
 WITHIN = 0.05  # default distance at which a goal is reached, where it is no place
 
@@ -144,7 +144,8 @@ class PlanStudy:
 
     def _planned(self, search: SearchConfig, what: str, keep: tuple[str, ...] = ()) -> PlayResult:
         if self.config.agent:
-            cost = cost_of(self.world, self.goal, self.config)
+            planned = self.goal or "reward" in self.world.spec.channels
+            cost = cost_of(self.world, self.goal, self.config) if planned else None
             return self._play(policy_of(self.config.agent, self.real.spec, self.world, cost), what, self.sees, keep)
         if self.places:
             return self._play(partial(walker, self.world, search), what, self.sees, keep)
@@ -188,6 +189,13 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     if not config.apart >= 0:
         raise TerrellaError("--apart is 0 or more.")
+    refuse_randomised(name, config.environment)
+    if config.success:
+        refuse(config, f"--success {config.success} says when an episode has succeeded", "within")
+    elif config.goal == REWARD:
+        refuse(config, "the highest return has no distance at which it is reached", "within")
+    if not is_recording(config.goal):
+        refuse(config, "the goal is not drawn from the views of a recording", "apart")
     if library.is_truth(name):
         world: World = FullyObserved(open_copied(name, config.environment))
     else:
@@ -208,7 +216,8 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
         refuse(config, "a reward is summed up to the end of the episode", "cost")
     whole = config.search.filled().horizon
     search = config.search.filled(replan=whole) if config.cost == "last" else config.search.filled()
-    planner_of(world, goal, config, search)  # refuses what does not fit, before anything is played
+    if config.agent is None:
+        planner_of(world, goal, config, search)  # refuses what does not fit, before anything is played
     return PlanStudy(config, search, world, real, goal, _criterion(config, goal, real.spec), limit or STEPS, progress)
 
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..act.planning import FullyObserved
-from ..core.errors import ActionError, PlanningError
+from ..core.errors import ActionError, PlanningError, TerrellaError
 from ..core.spec import Spec, kind_of
 from ..core.world import World
 from ..data.channels import facts_of
+from ..library import is_truth
 from .opening import EnvironmentConfig
 
 STEPS = 200  # of an episode, where the environment sets no limit
@@ -23,12 +24,20 @@ _NOT_COMPARED = {
 
 
 def open_real(real: str, environment: EnvironmentConfig, spec: Spec) -> World:
-    """The real environment of a world with this spec, with pictures of the size that the world observes."""
+    """The real environment of a world with this spec, with pictures of the size that the world observes. What is randomised is
+    the simulator that stands for the world, never the real environment."""
+    environment = replace(environment, randomise=None)
     shape = spec.channels["rgb"].shape if "rgb" in spec.channels else None
     if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
         environment = replace(environment, size=(shape[0], shape[1]))
     takes_snapshots = any(kind_of(channel) == "snapshot" for channel in spec.observes)
     return FullyObserved(open_copied(real, environment)) if takes_snapshots else environment.open(real)
+
+
+def refuse_randomised(world: str, environment: EnvironmentConfig) -> None:
+    """TerrellaError where --randomise is given for a learned world."""
+    if environment.randomise is not None and not is_truth(world):
+        raise TerrellaError(f"{world} was learned and is as it is; --randomise is for simulators (mujoco:NAME).")
 
 
 def open_copied(name: str, environment: EnvironmentConfig) -> World:

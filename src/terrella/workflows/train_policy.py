@@ -23,7 +23,7 @@ from ..learn.recipes.policy import Practice
 from ..measure.statistics import Figure, mean_interval
 from .opening import Device, EnvironmentConfig, load_named
 from .progress import Progress, silent, stage
-from .real_environment import STEPS, check_alike, open_copied, open_real
+from .real_environment import STEPS, check_alike, open_copied, open_real, refuse_randomised
 from .results import jsonable
 
 
@@ -110,8 +110,7 @@ def train_policy(world: str | Path, config: TrainPolicyConfig, *, progress: Prog
         raise TerrellaError("--episodes is a whole number from 1 up.")
     if config.grow and environment.randomise is None:
         raise TerrellaError("--grow widens the ranges of a file: name it with --randomise FILE.")
-    if environment.randomise is not None and not library.is_truth(world):
-        raise TerrellaError(f"{world} was learned and is as it is; --randomise is for simulators (mujoco:NAME).")
+    refuse_randomised(world, environment)
     truth = library.is_truth(world)
     inside = open_copied(world, environment) if truth else load_named(world, config.device, progress=progress)
     outside = None if config.real is None else open_real(config.real, environment, inside.spec)

@@ -24,7 +24,7 @@ from ..measure.transfer_scores import (
     verdict,
 )
 from .progress import Progress, silent
-from .results import jsonable, table_lines
+from .results import changed_settings, jsonable, table_lines
 from .transfer_arms import run_seed
 from .transfer_experiment import DIAL, TransferExperiment, check_pair, check_robot, claim_folder, looks_hash, robot_hash
 from .transfer_recorded import RecordedTransferResult, transfer_to_recording
@@ -105,10 +105,10 @@ def transfer(
     if not config.real_episodes or min(counts) < 1:
         raise TerrellaError("--episodes, --seeds, --practice, --workers and --real-episodes are 1 or more.")
     if config.real is not None and not library.is_truth(config.real):
-        other = config.gap or config.look or config.looks or config.camera
-        if other or config.dial != 1 or set(config.arms) != set(ARMS):
+        used = {"sim", "real", "randomise", "real_episodes", "out", "seed"}
+        if unused := [f"--{name.replace('_', '-')}" for name in changed_settings(config) if name not in used]:
             raise TerrellaError(
-                f"{config.real} is a recording, which has no --gap, --dial, --look, --looks, --camera and --arms; leave them out."
+                f"{config.real} is a recording, which has no use for {', '.join(unused)}; leave that out."
             )
         real, count = Path(config.real), max(config.real_episodes)
         return transfer_to_recording(config.sim, real, config.randomise, count, out=config.out, seed=config.seed)
