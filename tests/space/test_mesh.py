@@ -105,7 +105,8 @@ def test_without_scikit_image_it_is_said_what_to_install(monkeypatch):
 
 @pytest.mark.parametrize("name, option", [("a.glb", ["--axes", "rub"]), ("a.png", ["--compressed"]), ("a.spz", ["--compressed"]),
                                           ("a.html", ["--cell", "0.2"]),
-                                          ("a.glb", ["--cell", "0.2", "--kind", "collider"]), ("a.ply", ["--seconds", "3"])])  # fmt: skip
+                                          ("a.glb", ["--cell", "0.2", "--kind", "collider"]),
+                                          ("a.ply", ["--seconds", "3"])])  # fmt: skip
 def test_options_of_other_files_are_refused(tmp_path, capsys, name, option):
     assert main(["space", "export", str(tmp_path / "none"), str(tmp_path / name), *option]) == 2
     assert option[0] in capsys.readouterr().err and not (tmp_path / name).exists()
