@@ -107,6 +107,19 @@ def test_texts_are_the_task_or_named_and_pickles_are_named(tmp_path):
         assert any(name in note for note in notes), name
 
 
+def test_what_has_no_row_for_each_step_of_one_episode_is_named(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    odd = {"goal": np.zeros(2), "matrix": np.zeros((1, ROWS)), "terminals": np.full(ROWS, np.nan)}
+    saved(
+        tmp_path / "a.hdf5", {"action": ACTION, "observations/images/top": np.zeros((ROWS, 40, 32, 3), np.uint8), **odd}
+    )
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["nothing"] = h5py.Empty("f")
+    source = open_source(tmp_path / "a.hdf5", fps=10)
+    assert set(source.sensors) == {"action", "observation.images.top", "next.done"} and len(list(source.takes())) == 1
+    assert [sum(name in note for note in source.notes) for name in ("goal", "matrix", "nothing")] == [1, 1, 1]
+
+
 def test_bounds_that_do_not_fit_are_refused(tmp_path):
     for bounds in ({"episode_ends": np.array([5, 99])}, {"episode_ends": np.array([5, 5])}):
         saved(tmp_path / "a.npz", {"observations": STATE, "actions": ACTION, **bounds})

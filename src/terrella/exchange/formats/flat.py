@@ -126,7 +126,7 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
         if role == rows.OBSERVATION and following is not None and following.shape == array.shape and not more[place]:
             after[place] = following
         surplus = {0} if role not in (rows.OBSERVATION, rows.INFO, None) else {0, 1, len(spans)}
-        if len(spans) > 1 and more[place] not in surplus:
+        if (len(spans) > 1 or role is None) and more[place] not in surplus:
             if role not in (rows.INFO, None):
                 has = f"{array.shape[0] if array.shape else 'no'} rows where {count} are needed"
                 raise DatasetError(f"'{arrays.spelled(place)}' in {where} has {has}; mend or drop it.")
@@ -170,7 +170,7 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
         elif rowwise and head in _FIRST:
             ends[:-1] |= array.read(0, count).reshape(-1)[1:].astype(bool)
         elif rowwise and (head in _LAST or NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)):
-            flags |= array.read(0, count).reshape(-1).astype(bool)
+            flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
     return ends if ends.any() else flags
 
 

@@ -135,6 +135,8 @@ def concatenated(file: File, count: int, *pieces: tuple[Place, int, int]) -> Arr
 
 def array_at(file: File, place: Place, item: Dataset) -> Array:
     """A dataset of any type as an array that is read when its values are needed."""
+    if item.shape is None:  # an empty dataset, which has no values at all
+        return Array((), item.dtype)
     if item.dtype.kind in "biuf" and item.ndim:
         return concatenated(file, len(item), (place, 0, len(item)))
     path = Path(file.filename)
@@ -151,7 +153,7 @@ def array_at(file: File, place: Place, item: Dataset) -> Array:
 
 def headers(items: Iterable[tuple[tuple[str, ...], Dataset]]) -> dict[Place, Array]:
     """Shape and dtype of datasets, without their values."""
-    return {place: Array(item.shape, item.dtype) for place, item in items}
+    return {place: Array(item.shape or (), item.dtype) for place, item in items}
 
 
 def read_strings(dataset: Group | Dataset) -> list[str]:

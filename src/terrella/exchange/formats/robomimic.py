@@ -119,7 +119,7 @@ def _demo(path: Path, name: str, sensors: Mapping[arrays.Place, Sensor], fps: fl
         lines = {
             place: hdf5_file.array_at(file, ("data", name, *place), item)
             for place, item in stored.items()
-            if item.ndim < 2 and item.dtype.kind in "SO" and place not in sensors
+            if item.shape is not None and item.ndim < 2 and item.dtype.kind in "SO" and place not in sensors
         }
         texts = {place: arrays.texts(array) for place, array in lines.items() if array.is_text}
         parts = {}

@@ -62,7 +62,8 @@ def sensor_for(role: str, key: str, shape: Sequence[int], dtype, least: int = LE
         return stored_as(Sensor(name, "vector", (math.prod(shape),), dtype.name), shape)
     height, width = shape[1:] if layout == "chw" else shape[:2]
     check_size(height, width, f"a picture of '{key or role}'")
-    return stored_as(Sensor(f"{IMAGES}{key or CAMERA}", "image", (height, width, 3), "uint8"), shape)
+    camera = key.removeprefix("images.") or CAMERA
+    return stored_as(Sensor(f"{IMAGES}{camera}", "image", (height, width, 3), "uint8"), shape)
 
 
 def stored_as(sensor: Sensor, shape: tuple[int, ...]) -> Sensor:
