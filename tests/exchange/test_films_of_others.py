@@ -13,6 +13,7 @@ from terrella.core.files import creating, remedy_of
 from terrella.data import Dataset
 from terrella.data.storage.mp4 import Mp4Writer, decode_frames, finish_video
 from terrella.exchange import open_source, write_source
+from terrella.exchange.merging.write import merge_into
 from terrella.space.pictures.reading import video_pictures
 
 RGB = "observation.images.rgb"
@@ -45,7 +46,7 @@ def film(path, count=6, size=(64, 96), ratio=None, cover=0, sound=False, cover_c
             container.mux([*tone.encode(quiet), *tone.encode()])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES[:4], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[4:])])
 def test_a_name_is_a_file_and_never_an_address(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)  # relative paths, as people give them
     (tmp_path / name).mkdir()
@@ -85,6 +86,8 @@ def test_a_cover_is_not_the_film(tmp_path, suffix, cover):
     assert rows.shape == (6, 64, 96, 3) and abs(int(rows[0].mean()) - 40) < 6
     assert any("sound" in note for note in notes) and any("48 x 48" in note for note in notes)
     assert video_pictures(tmp_path / "films" / f"a.{suffix}", 2, 96)[0].mean() < 90
+    facts, _ = merge_into({"a": open_source(tmp_path / "films")}, tmp_path / "merged")
+    assert any("sound" in note for note in facts["notes"])
 
 
 @pytest.mark.parametrize("ratio, width", [(Fraction(16, 11), 140), (Fraction(1, 2), 48), (Fraction(1), 96)])

@@ -111,6 +111,7 @@ def _write(source: Source, layout: Layout, root: Path, lead: str, how: LeRobotRo
     left_out, notes = [], dict[str, None]()  # each note once, in order
     with Recorder(root, layout, interrupted="discard") as recorder:
         for number, take in enumerate(source.takes()):
+            notes |= dict.fromkeys(take.notes)
             at = _row_times(source, take, layout, lead, how)
             if len(at) < 2:
                 left_out.append(f"take {number} was left out: it has {len(at)} row{'s' * (len(at) != 1)}")

@@ -82,7 +82,7 @@ def merge(
                     count.skipped.append(f"take {number}: its mapped sensors give fewer than two rows")
                 else:
                     origin = {"embodiment": source.embodiment, "source": source.path, "take": number}
-                    yield replace(merged, facts={**take.facts, **merged.facts, **origin})
+                    yield replace(merged, facts={**take.facts, **merged.facts, **origin}, notes=take.notes)
         report.complete = True
 
     robots = set(mapping.embodiments)
