@@ -105,6 +105,9 @@ def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):
     assert len((tmp_path / "w" / "world.edits.jsonl").read_text().splitlines()) == 2
     assert main(["space", "edit", place, "--sphere", "90", "2", "1", "0.8", "--delete"]) == 2
     assert main(["space", "edit", place, "--redo"]) == 2
+    capsys.readouterr()
+    assert main(["space", "edit", place, "--object", "3", "--delete"]) == 2
+    assert "has no object 3; its objects: none" in capsys.readouterr().err
     assert main(["space", "edit", place, "--delete"]) == 2  # of what?
     assert main(["space", "edit", place, "--undo", "--sphere", "0", "2", "1", "0.8"]) == 2
     with pytest.raises(CheckpointError, match="has edits"):

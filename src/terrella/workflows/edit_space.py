@@ -8,6 +8,7 @@ from ..core.errors import CheckpointError, TerrellaError
 from ..library import folder_of
 from ..space.edits import ACTIONS, Edit, apply_edits
 from ..space.occupancy import extent
+from ..worlds.splat import SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merge_edit, merged_loader, read_edits, write_edits
 from .progress import Progress, silent
 from .splat_places import SpaceResult, open_splat
@@ -27,7 +28,7 @@ class EditSpaceConfig:
     everything."""
     sphere: tuple[float, float, float, float] | None = None  # Select the sphere around a point (x y z radius, metres).
     plane: tuple[float, float, float, float] | None = None  # Select one side of a plane (a b c d: a x + b y + c z > d).
-    object: int | None = None  # Select the object with this number (`space view` shows it).
+    object: int | None = None  # Select the object with this number. A wrong one lists the objects.
     move: Triple | None = None  # Move by x y z metres.
     duplicate: Triple | None = None  # Add a copy that is moved by x y z metres.
     turn: float | None = None  # Turn to the left about its middle, in degrees.
@@ -69,6 +70,7 @@ def edit_space(world: str, config: EditSpaceConfig, *, progress: Progress = sile
     else:
         opened = open_splat(world)
         new = undone[-1] if config.redo else _new_edit(folder, config)
+        _check_object(world, opened, config.object)
         apply_edits(opened.gaussians, [new], opened.objects, merged_loader(folder))  # raises if it cannot be done
         write_edits(folder, [*edits, new], undone[:-1] if config.redo else ())
     return _result(world, config, progress)
@@ -86,6 +88,15 @@ def _check(world: str, config: EditSpaceConfig, edits: list[Edit], undone: list[
         raise TerrellaError("--merge, --undo, --redo and --replay change the whole place; leave the selection out.")
     if config.undo and not edits or config.redo and not undone:
         raise TerrellaError(f"{world} has no edit to {'undo' if config.undo else 'redo'}.")
+
+
+def _check_object(world: str, opened: SplatWorld, number: int | None) -> None:
+    """TerrellaError, with the objects that there are, for an object that there is not."""
+    if number is None or bool((opened.objects == number).any()) and number > 0:
+        return
+    names = dict(enumerate(opened.object_names, 1))
+    there = [f"{k} {names.get(k, '')}".strip() for k in opened.objects.unique().tolist() if k > 0]
+    raise TerrellaError(f"{world} has no object {number}; its objects: {', '.join(there[:40]) or 'none'}.")
 
 
 def _new_edit(folder: Path, config: EditSpaceConfig) -> Edit:
@@ -121,7 +132,10 @@ def _result(world: str, config: EditSpaceConfig, progress: Progress) -> SpaceRes
             f"{world} is so large now that floors and walls have cells of {cell_m:.1f} m; --undo takes that back, and "
             f"--scale makes {config.merge} smaller first."
         )
-    return SpaceResult({**facts, "gaussians": len(after.gaussians)})
+    made = f"{facts['edits']} edit(s), {len(after.gaussians):,} Gaussians"
+    more = "" if config.undo else f"; take the last one back: terrella space edit {world} --undo"
+    lines = (made + more, f"walk in it: terrella play {world}")
+    return SpaceResult({**facts, "gaussians": len(after.gaussians)}, lines)
 
 
 def _text_of(path: Path) -> str:
