@@ -145,6 +145,14 @@ def test_a_render_mode_without_a_picture_is_named_and_one_with_depth_is_drawn():
     assert "rgb" in GymnasiumWorld(deep).spec.channels
 
 
+def test_what_info_holds_after_a_step_only_is_named_too():
+    class Late(Plain):
+        def info(self):
+            return {"speed": 1.0} if self.steps else {}
+
+    assert "Left out: info.speed (no channel reads it; an adapter can)." in describe(GymnasiumWorld(Late).spec)
+
+
 def test_the_form_in_which_pictures_are_drawn_is_named():
     assert (
         "pictures of 24x32 (drawn as float64 [24, 32] up to 1)"

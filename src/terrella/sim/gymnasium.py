@@ -21,7 +21,7 @@ from ..core.state import State
 from ..core.world import make_rng
 from .drawn_pictures import DrawnPictures
 from .environment_facts import EnvironmentFacts, facts_of
-from .environment_loading import build, explained, first_picture, renders_pictures
+from .environment_loading import build, explained, first_picture, infos_of_step, renders_pictures
 from .observation_channels import check_space, entry_at, label_of, parts_of, resized, space_of, value_at
 from .processes import MAX_EPISODES, Processes
 from .snapshot import NotCopyable, Snapshots
@@ -151,10 +151,11 @@ class GymnasiumWorld:
         self._drawn = DrawnPictures()
         self._rgb_size, why = self._picture_size(seen) if rgb else (None, "")
         left_out = self._parts.left_out | ({"pictures": why} if why else {})
-        left_out |= {
-            f"info.{key}": "no channel reads it; an adapter can" for key in info if key not in self._used_infos()
-        }
-        self.spec = self._describe(facts_of(self._env, adapter.action_names), config.dt_s, left_out)
+        facts = facts_of(self._env, adapter.action_names)
+        infos = dict.fromkeys([*info, *(infos_of_step(self._env) if config.forkable is not False else ())])
+        unread = [key for key in infos if key not in self._used_infos()]
+        left_out |= {f"info.{key}": "no channel reads it; an adapter can" for key in unread}
+        self.spec = self._describe(facts, config.dt_s, left_out)
         limit = self._env.spec.max_episode_steps if self._env.spec else None
         if isinstance(env, str) and "max_episode_steps" not in options:
             limit = gymnasium.registry[self._env.spec.id].max_episode_steps
