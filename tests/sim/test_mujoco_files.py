@@ -141,6 +141,13 @@ def test_a_pose_at_rest_is_held(tmp_path, servo, key, rest):
     assert moved_by(world, world.spec.idle)[0] == pytest.approx(home, abs=0.05)
 
 
+def test_added_servos_do_not_take_the_defaults_of_motors(tmp_path):
+    defaults = '<default><motor gear="5e-4" ctrlrange="-1 1" forcerange="-1e-3 1e-3"/><general gear="5e-4"/></default>'
+    text = BODY.format("").replace("<worldbody>", f"{defaults}<worldbody>")
+    world = world_of(tmp_path, text)
+    assert world.spec.action.high[0] == pytest.approx(np.pi) and moved_by(world, [2.0]) == pytest.approx(2, abs=0.02)
+
+
 def test_limits_of_the_file_stay_and_nothing_is_noted(tmp_path):
     world = world_of(tmp_path, ARM.format("", "", '<position joint="swing" kp="9" ctrlrange="-.5 .25"/>', ""))
     assert (world.spec.action.low[0], world.spec.action.high[0]) == (-0.5, 0.25) and "notes" not in world.spec.card

@@ -117,9 +117,9 @@ def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         stiff = max(inertia * (2 * np.pi * SERVO_HZ) ** 2, firm)
         servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         servo.set_to_position(stiff, kv=2 * SERVO_DAMPING * float(np.sqrt(stiff * inertia)))
+        servo.gear, servo.forcelimited = [1, 0, 0, 0, 0, 0], False  # the file's defaults may say otherwise
         servo.ctrllimited = bool(model.jnt_limited[at])
-        if servo.ctrllimited:
-            servo.ctrlrange = model.jnt_range[at]
+        servo.ctrlrange = model.jnt_range[at] if servo.ctrllimited else [0, 0]
 
 
 def _weights(model: mujoco.MjModel) -> list[float]:
