@@ -95,8 +95,8 @@ def _check_object(world: str, opened: SplatWorld, number: int | None) -> None:
     if number is None or bool((opened.objects == number).any()) and number > 0:
         return
     names = dict(enumerate(opened.object_names, 1))
-    there = [f"{k} {names.get(k, '')}".strip() for k in opened.objects.unique().tolist() if k > 0]
-    raise TerrellaError(f"{world} has no object {number}; its objects: {', '.join(there[:40]) or 'none'}.")
+    listed = [f"{k} {names.get(k, '')}".strip() for k in opened.objects.unique().tolist() if k > 0]
+    raise TerrellaError(f"{world} has no object {number}; its objects: {', '.join(listed[:40]) or 'none'}.")
 
 
 def _new_edit(folder: Path, config: EditSpaceConfig) -> Edit:
