@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 from terrella.serve.protocol import REPLAY, HeldControls, Show
 from terrella.serve.session import MAX_UNACKED, Session
@@ -245,3 +247,33 @@ def test_a_world_that_cannot_start_is_reported():
         assert "cannot start" in socket.events[-1]["text"]
 
     play(scenario, NoStart())
+
+
+class SlowlyDrawn(Panorama):
+    """A simulator whose pictures take five of its steps."""
+
+    def __init__(self, kind: str):
+        super().__init__(dt_s=1 / 100)
+        self.spec = replace(self.spec, card={"kind": kind})
+
+    def render(self, state, channels):
+        if "rgb" in channels:
+            time.sleep(0.05)
+        return super().render(state, channels)
+
+
+def test_a_simulator_that_is_drawn_slowly_keeps_its_pace_and_a_learned_world_draws_every_step():
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: len(socket.frames) >= 12)
+        steps = [frame.step for frame in socket.frames]
+        if session.timeline.spec.card["kind"] == "simulator":
+            assert max(later - step for step, later in zip(steps[4:], steps[5:])) >= 4
+        else:
+            assert steps == list(range(steps[0], steps[0] + len(steps)))
+        moments = session.timeline.history
+        assert moments.at(steps[-2]).step == steps[-2], "steps that are not drawn can be gone back to"
+
+    for kind in ("simulator", "learned"):
+        play(scenario, SlowlyDrawn(kind))

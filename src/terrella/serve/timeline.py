@@ -156,8 +156,9 @@ class Timeline:
         return self._begin(0, states)
 
     @torch.inference_mode()
-    def step(self, held: Sequence[str] = (), axes: Sequence[float] = ()) -> Moment:
-        """One step of every world, with the action of the person or the agent; after `done`, the first moment of a new episode."""
+    def step(self, held: Sequence[str] = (), axes: Sequence[float] = (), draw: bool = True) -> Moment:
+        """One step of every world, with the action of the person or the agent; after `done`, the first moment of a new episode.
+        Without `draw` the moment has the pictures of the one before, unless it is recorded."""
         if self.rewound:
             self._return_to(self.history.newest)
         if self.shown.flags & DONE:
@@ -165,7 +166,7 @@ class Timeline:
         action = self.driver.action(self.obeyed, held, axes, self._states[0], self._rngs[-1])
         pairs = zip(self.worlds, self._states, self._rngs, strict=False)
         self._states = tuple(world.imagine(state, action, rng) for world, state, rng in pairs)
-        return self._show(self.shown.step + 1, 0, action)
+        return self._show(self.shown.step + 1, 0, action, draw or self.recording.on)
 
     def stand_at(self, step: int) -> Moment:
         """Shows a moment of the past without going on from it."""
@@ -304,14 +305,15 @@ class Timeline:
         self.notice = ""
         return state
 
-    def _show(self, step: int, flags: int, action: torch.Tensor | None) -> Moment:
-        observations = [self._observed(number) for number in range(len(self.worlds))]
+    def _show(self, step: int, flags: int, action: torch.Tensor | None, draw: bool = True) -> Moment:
+        observations = [self._observed(number, draw) for number in range(len(self.worlds))]
         seen, last = observations[0], observations[-1]
-        images = tuple(
+        drawn = (
             Image(number, camera, encode_jpeg(observations[number][name]))
             for number in range(len(self.worlds))
             for camera, name in self._shown_of(number).items()
         )
+        images = tuple(drawn) if draw else self.shown.images
         acted = action is not None
         reward = float(seen["reward"][0]) if "reward" in seen and acted else 0.0
         done = bool(seen["done"][0]) if "done" in seen and acted else False
@@ -345,10 +347,10 @@ class Timeline:
         now = {name: float(seen[name][0]) for name in names}
         return tuple(earlier[name] + now[name] * acted if name in events else now[name] for name in names)
 
-    def _observed(self, number: int) -> Mapping[str, torch.Tensor]:
-        """The channels of a world that are shown, and those that are recorded."""
+    def _observed(self, number: int, draw: bool) -> Mapping[str, torch.Tensor]:
+        """The channels of a world that are shown, its pictures if `draw`, and those that are recorded."""
         spec = self.worlds[number].spec
-        wanted = [*self._shown_of(number).values(), "uncertainty"]
+        wanted = [*(self._shown_of(number).values() if draw else ()), "uncertainty"]
         if number == 0:
             wanted += ["reward", "done", *numbers_of(spec), *(spec.recorded if self.recording.on else ())]
         names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))

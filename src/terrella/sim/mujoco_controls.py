@@ -68,7 +68,11 @@ def kind_of_control(model: mujoco.MjModel, at: int) -> str:
 
 
 def control_name(model: mujoco.MjModel, at: int) -> str:
-    return model.actuator(at).name or f"actuator {at + 1}"
+    """The name of an actuator, else of the joint that it alone drives, else its number."""
+    driven = [model.actuator_trnid[one, 0] for one in range(model.nu) if model.actuator_trntype[one] in _JOINT]
+    joint = int(model.actuator_trnid[at, 0])
+    alone = model.actuator_trntype[at] in _JOINT and driven.count(joint) == 1
+    return model.actuator(at).name or (alone and model.joint(joint).name) or f"actuator {at + 1}"
 
 
 def control_unit(model: mujoco.MjModel, at: int) -> str:
