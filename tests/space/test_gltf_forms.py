@@ -367,3 +367,9 @@ def test_what_is_not_read_is_named(tmp_path, capsys):
     small = ["--gaussians", "1000", "--size", "24", "32"]
     assert main(["space", "build", str(tmp_path / "a.gltf"), "--out", str(tmp_path / "out"), *small]) == 0
     assert "left out: KHR_materials_transmission, 1 meshes of points or lines, animations" in capsys.readouterr().out
+
+
+def test_a_thing_without_a_name_has_that_of_the_node_above(tmp_path):
+    file = File()
+    nodes = [{"name": "table", "children": [1, 2]}, {"children": [3]}, {"mesh": 0, "name": "leaf"}, {"mesh": 0}]
+    assert file.read(tmp_path, file.floor(), nodes=nodes).names == ("table", "leaf")

@@ -84,7 +84,8 @@ def read_gltf(path: str | Path, scale: float = 1.0) -> GltfScene | Gaussians:
 
 
 def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
-    """All visible nodes of the shown scene: the number of each, and its matrix [4, 4] to the world, which ends with `whole`."""
+    """All visible nodes of the shown scene: the number of each, and its matrix [4, 4] to the world, which ends with `whole`. A node
+    without a name has that of the one above it."""
     about = file.about
     if len(about.get("nodes", [])) > MOST_NODES:
         raise ValueError(f"it has {len(about['nodes']):,} nodes, {MOST_NODES:,} is the most")
@@ -93,18 +94,18 @@ def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[int, dict[str, Any],
     else:
         inner = {child for node in about.get("nodes", []) for child in node.get("children", [])}
         roots = [k for k in range(len(about.get("nodes", []))) if k not in inner]
-    waiting, seen = [(root, whole) for root in reversed(roots)], set()
+    waiting, seen = [(root, whole, "") for root in reversed(roots)], set()
     while waiting:
-        index, above = waiting.pop()
+        index, above, name = waiting.pop()
         if index in seen:
             raise ValueError("its nodes go in a circle")
         node = file.named("nodes", index)
         seen.add(index)
         if node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible") is False:
             continue
-        matrix = above @ _matrix(node)
-        yield index, node, matrix
-        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+        matrix, name = above @ _matrix(node), _name(file, node) or name
+        yield index, {**node, "name": name}, matrix
+        waiting += [(child, matrix, name) for child in reversed(node.get("children", []))]
 
 
 def _instances(file: Gltf, node: dict[str, Any], matrix: np.ndarray) -> list[tuple[dict[str, Any], np.ndarray]]:
@@ -114,7 +115,7 @@ def _instances(file: Gltf, node: dict[str, Any], matrix: np.ndarray) -> list[tup
     moves = {name.lower(): file.numbers(given[name], width) for name, width in widths.items() if name in given}
     if not moves or "mesh" not in node:
         return [(node, matrix)]
-    name, count = _name(file, node) or "thing", min(map(len, moves.values()))
+    name, count = node["name"] or "thing", min(map(len, moves.values()))
     if count > MOST_NODES:
         raise ValueError(f"it has {count:,} instances of {name}, {MOST_NODES:,} is the most")
     bare = {key: value for key, value in node.items() if key not in ("extensions", "skin")}
@@ -125,7 +126,8 @@ def _instances(file: Gltf, node: dict[str, Any], matrix: np.ndarray) -> list[tup
 
 
 def _name(file: Gltf, node: dict[str, Any]) -> str:
-    return str(node.get("name") or file.named("meshes", node["mesh"]).get("name") or "")[:80]
+    mesh = file.named("meshes", node["mesh"]) if "mesh" in node else {}
+    return str(node.get("name") or mesh.get("name") or "")[:80]
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
@@ -169,7 +171,7 @@ def _scene(file: Gltf, nodes: list, parts: list, places: dict[int, np.ndarray]) 
             raise ValueError("it speaks of a material which it has not")
         one = _triangles(file, node, matrix, part, base_of(abouts[which] if which >= 0 else {})[1], places)
         if id(node) not in numbers:
-            names.append(_name(file, node) or f"thing {len(names) + 1}")
+            names.append(node["name"] or f"thing {len(names) + 1}")
             numbers[id(node)] = len(names)
         corners.append(one)
         material.append(np.full(len(one), which, np.int32))
