@@ -10,7 +10,7 @@ import torch
 
 from terrella.core import check_world
 from terrella.core.errors import ProtocolError
-from terrella.serve.chart import has_known_share, map_kind, tint_invented
+from terrella.serve.chart import _imagined_share, has_known_share, map_kind, tint_invented
 from terrella.serve.protocol import Show, parse_message
 from terrella.serve.timeline import Timeline
 
@@ -90,7 +90,7 @@ def inside(page) -> np.ndarray:
 def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 100)]).url)
     until(page, f"terrella.map.shown && terrella.map.places === {SLOTS}")
-    assert page.locator("#map-known").text_content() == "50% from memory"
+    assert page.locator("#map-known").text_content() == "33% from memory, 17% imagined before"
     assert page.locator("#map-kinds span").all_text_contents() == ["3 recorded", "3 observed", "2 imagined"]
     page.keyboard.down("KeyW")
     until(page, "terrella.map.path > 8 && terrella.map.camera[0] > 1")
@@ -178,3 +178,13 @@ def test_on_a_phone_it_is_closed_at_first_and_fits_when_opened(serve_world, open
         assert box["x"] >= 0 and box["y"] >= 0, name
         assert box["x"] + box["width"] <= size[0] and box["y"] + box["height"] <= size[1], name
     assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+
+
+def test_memory_of_its_own_imagination_is_no_memory_of_the_world():
+    """Six recorded views to the east and six imagined to the west, all of which look east."""
+    held = torch.tensor([[x, 0.1 * at, 0.0, kind] for x, kind in ((8.0, 1.0), (-8.0, 3.0)) for at in range(6)])
+    pose = lambda x: torch.tensor([x, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # noqa: E731
+    assert [_imagined_share(pose(x), held) for x in (8.0, -8.0)] == [0.0, 1.0]
+    assert 0 < _imagined_share(pose(0.0), held) < 1 and _imagined_share(pose(0.0), held[:0]) == 0.0
+    floor = torch.cat([held, torch.tensor([[-8.0, 0.0, 0.0, 4.0]] * 9)])
+    assert _imagined_share(pose(-8.0), floor) == 1.0, "ground to stand on is no view"

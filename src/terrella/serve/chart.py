@@ -11,7 +11,7 @@ import simplejpeg
 import torch
 from PIL import Image
 
-from ..core.spec import Spec
+from ..core.spec import WALKABLE, Spec
 from ..core.state import State
 from ..core.world import World
 from ..space.camera import yaw
@@ -19,6 +19,7 @@ from ..space.camera import yaw
 AMBER = (1.25, 0.95, 0.5)  # the tint of invented pixels, times their brightness
 STRENGTH = 0.85
 PLACES, MOSAIC = "places", "mosaic"  # kinds of maps
+IMAGINED, NEAREST = 3, 6  # kind of views, and how many of them a picture is drawn from
 EVERY_S = {PLACES: 0.1, MOSAIC: 0.25}  # between two maps
 FINEST, QUALITY = 640, 85  # of the JPEG of a mosaic: most pixels across, and quality
 
@@ -40,16 +41,30 @@ def map_event(world: World, state: State) -> dict:
 
 
 def _places(world: World, state: State) -> dict:
-    """camera: [x, y, heading], to the millimetre. known: the share of the picture that comes from memory (None if the world has no
-    such channel). places: x, y, heading and kind of each, to the centimetre, in one flat list without empty slots."""
+    """camera: [x, y, heading], to the millimetre. known: the share of the picture that comes from memory of what was recorded or
+    observed (None if the world has no such channel); imagined: that from memory of what it imagined itself. places: x, y, heading and kind of each, to the centimetre, in one flat list without empty slots."""
     wanted = ["pose", "places", *(["known"] if has_known_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     held = seen["places"][seen["places"][:, 3] > 0]
+    share = float(seen["known"].mean()) if "known" in seen else None
+    imagined = 0.0 if share is None else share * _imagined_share(seen["pose"], held)
     return {
         "camera": [round(number, 3) for number in (*seen["pose"][:2].tolist(), float(yaw(seen["pose"])))],
-        "known": round(float(seen["known"].mean()), 3) if "known" in seen else None,
+        "known": None if share is None else round(share - imagined, 3),
+        "imagined": round(imagined, 3),
         "places": held.flatten().double().round(decimals=2).tolist(),
     }
+
+
+def _imagined_share(pose: torch.Tensor, held: torch.Tensor) -> float:
+    """The share of imagined views among those views [n, 4] of memory that are nearest to a pose [7], a radian counting as 2 m."""
+    views = held[held[:, 3] < WALKABLE]
+    if not len(views):
+        return 0.0
+    turn = (views[:, 2] - yaw(pose) + torch.pi) % (2 * torch.pi) - torch.pi
+    apart = (views[:, :2] - pose[:2]).norm(dim=1) + 2 * turn.abs()
+    nearest = views[apart.argsort()[:NEAREST], 3]
+    return float((nearest == IMAGINED).float().mean())
 
 
 def _mosaic(world: World, state: State) -> dict:

@@ -16,7 +16,7 @@ export class MemoryMap {
   }
 
   /** A chart event (see serve/protocol.py); `length` is how many steps are remembered of the way. */
-  show({ step, camera, known, places }) {
+  show({ step, camera, known, imagined, places }) {
     if (places) this.take(places);
     if (step < this.step) this.path = this.path.filter((place) => place.step <= step);
     const last = this.path[this.path.length - 1];
@@ -25,7 +25,7 @@ export class MemoryMap {
     if (this.path.length > LONGEST) this.path.splice(0, LONGEST / 4);
     this.camera = camera;
     this.step = step;
-    this.tell(known);
+    this.tell(known, imagined);
     this.draw();
   }
 
@@ -39,8 +39,8 @@ export class MemoryMap {
       Object.assign(document.createElement('span'), { className: `k${kind}`, textContent: `${count} ${name}` })));
   }
 
-  tell(known) {
-    const text = known === null ? '' : `${Math.round(100 * known)}% from memory`;
+  tell(known, imagined) {
+    const text = known === null ? '' : `${Math.round(100 * known)}% from memory${imagined > 0.05 ? `, ${Math.round(100 * imagined)}% imagined before` : ''}`;
     const node = document.getElementById('map-known');
     if (node.textContent !== text) node.textContent = text;
   }
