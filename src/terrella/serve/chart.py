@@ -42,7 +42,8 @@ def map_event(world: World, state: State) -> dict:
 
 def _places(world: World, state: State) -> dict:
     """camera: [x, y, heading], to the millimetre. known: the share of the picture that comes from memory of what was recorded or
-    observed (None if the world has no such channel); imagined: that from memory of what it imagined itself. places: x, y, heading and kind of each, to the centimetre, in one flat list without empty slots."""
+    observed (None if the world has no such channel); imagined: that from memory of what it imagined itself. places: x, y, heading
+    and kind of each, to the centimetre, in one flat list without empty slots."""
     wanted = ["pose", "places", *(["known"] if has_known_share(world.spec) else [])]
     seen = {name: tensor[0].cpu() for name, tensor in world.render(state, wanted).items()}
     held = seen["places"][seen["places"][:, 3] > 0]

@@ -204,8 +204,9 @@ def encode_event(kind: str, **body) -> str:
     futures: step at which they were requested, and plans, from the chosen one down to the worst: cost (null if not finite), and
              image, a JPEG in base64 of `frames` frames side by side, from the decision to the plan's end.
     chart:   world (its number on the page) and step, then camera [x, y in metres, heading in radians], known (the share of its
-             picture that comes from memory, or null), imagined (the share that it remembers from its own imagination) and, if they changed since the last chart, places: x, y, heading and kind
-             (1 recorded, 2 observed, 3 imagined, 4 walkable) of each, in one flat list. For a flat world instead, if it
+             picture that comes from memory, or null), imagined (the share that it remembers from its own imagination) and, if
+             they changed since the last chart, places: x, y, heading and kind (1 recorded, 2 observed, 3 imagined, 4 walkable)
+             of each, in one flat list. For a flat world instead, if it
              changed, mosaic: size [width, height in pixels] of the part that was seen, view: size of the picture in its middle,
              and in base64 image, a JPEG, and mask, a PNG that is transparent where nothing was seen.
     """
