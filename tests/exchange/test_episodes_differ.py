@@ -10,7 +10,7 @@ from PIL import Image
 
 from terrella.care.doctor import examine
 from terrella.core.errors import DatasetError
-from terrella.data import ClipCache, Clips, ClipsConfig, Dataset
+from terrella.data import ClipCache, Clips, ClipsConfig, Dataset, Layout, Recorder, Sensor
 from terrella.exchange import open_source, write_source
 from terrella.learn.recording import Recording
 
@@ -95,6 +95,9 @@ def test_padding_is_known_to_the_doctor_and_left_out_of_training(tmp_path):
     data = Dataset(tmp_path / "set")
     assert [episode.absent for episode in data.episodes] == [("observation.grip",), (RGB,), (), ("action",)]
     assert not data.episode(3)["action_valid"].any()
+    figures = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    assert figures["observation.grip"]["min"] == [1, 1] and figures["observation.grip"]["count"] == [27]
+    assert figures[RGB]["count"] == [27] and figures["observation.state"]["count"] == [36]
     where = {("rgb",): [0, 2, 3], ("rgb", "grip"): [2, 3], ("rgb", "action"): [0, 2], ("state",): [0, 1, 2, 3]}
     for channels, numbers in where.items():
         clips = Clips(data, ClipsConfig(4, (*channels, "episode"), 2, (16, 24), drop_last=False))
@@ -114,6 +117,23 @@ def test_padding_is_known_to_the_doctor_and_left_out_of_training(tmp_path):
         Clips(data, ClipsConfig(4, ("rgb", "grip", "action"), 1, (16, 24), episodes=[0, 1, 3]))
     remote = Clips(f"file://{tmp_path / 'set'}", ClipsConfig(4, ("rgb", "grip"), 1, (16, 24), cache_dir=tmp_path / "c"))
     assert remote.padded == (0, 1) and len(list(remote)) == 12
+
+
+def test_statistics_are_without_padding_after_a_kill_too(tmp_path):
+    layout = Layout(
+        10, {name: Sensor(name, "vector", (1,)) for name in ("observation.a", "observation.b")}, pictures="png"
+    )
+    for number in range(3):
+        with Recorder(tmp_path / "set", layout) as recorder:
+            for row in range(4):
+                b = None if number == 1 else np.array([5.0 + row])
+                recorder.add_row({"observation.a": np.array([float(row + 9 * number)]), "observation.b": b}, row / 10)
+        path = tmp_path / "set" / "meta" / "stats.json"
+        figures = json.loads(path.read_text())
+        assert figures["observation.b"]["min"] == [5] and figures["observation.b"]["count"] == [4 if number < 2 else 8]
+        if number == 1:  # as a kill between the statistics and info.json leaves them
+            path.write_text(json.dumps({name: {**it, "count": [99]} for name, it in figures.items()}))
+    assert examine(tmp_path / "set").faults == []
 
 
 def test_a_recording_without_gaps_keeps_its_cache(tmp_path):

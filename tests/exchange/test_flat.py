@@ -21,6 +21,7 @@ BOUNDS = {
     "Gymnasium": {"terminations": np.zeros(ROWS, bool), "truncations": LAST},
     "stable-baselines": {"episode_starts": FIRST, "episode_returns": np.zeros(3)},
     "Dreamer": {"is_first": FIRST, "is_last": LAST, "is_terminal": np.zeros(ROWS, bool)},
+    "dm_env": {"step_type": np.where(FIRST, 0, np.where(LAST, 2, 1)), "discount": np.ones(ROWS)},
     "diffusion policy": {"meta/episode_ends": np.array([5, 9, 12])},
     "lengths": {"episode_lengths": np.array(LENGTHS)},
     "numbers": {"episode_index": np.repeat([7, 3, 9], LENGTHS)},

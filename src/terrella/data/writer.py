@@ -39,7 +39,7 @@ from .format import (
     stream_path,
     to_arrow,
 )
-from .source import Sensor
+from .source import Sensor, is_outcome
 from .storage.tables import as_local
 
 ROWS_PER_GROUP = 256
@@ -120,7 +120,7 @@ class Writer:
         files.sync_file(table)
         for path, file in staged.items():
             files.move_into_place(file, self.root / path)
-        merged = stats.merge([self._stats, of_episode])
+        merged = stats.merge([self._stats, _without_padding(of_episode, draft.counts)])
         files.write_json(self.root / STATS, stats.to_json(merged))
         with files.replacing(self.root / TASKS) as path:
             pq.write_table(tasks_table(tasks), as_local(path), **_CHECKED)
@@ -197,19 +197,22 @@ class Writer:
         if self.episodes:
             self._tasks = pq.read_table(as_local(self.root / TASKS)).column("__index_level_0__").to_pylist()
             self._stats = stats.from_json(json.loads((self.root / STATS).read_text(encoding="utf-8")))
-            if any(int(summary["count"][0]) != self.rows for summary in self._stats.values()):
+            if int(self._stats["index"]["count"][0]) != self.rows:
                 self._stats = self._stats_of_episodes()  # the recorder was killed before info.json was replaced
 
     def _stats_of_episodes(self) -> dict[str, stats.Summary]:
         parts: dict[int, dict[str, stats.Summary]] = {}
+        counts: dict[int, dict[str, int]] = {}
         for file in sorted((self.root / "meta" / "episodes").glob("chunk-*/file-*.parquet")):
             for row in pq.read_table(as_local(file)).to_pylist():
                 part = parts.setdefault(row["episode_index"], {})
+                counts[row["episode_index"]] = json.loads(row.get("counts") or "{}")
                 for name, value in row.items():
                     if name.startswith("stats/"):
                         _, feature, key = name.split("/")
                         part.setdefault(feature, {})[key] = np.array(value)
-        return stats.merge(parts[number] for number in range(self.episodes))
+        whole = (_without_padding(parts[number], counts[number]) for number in range(self.episodes))
+        return stats.merge(whole)
 
     # -- files of an episode ------------------------------------------------------------------------------------
 
@@ -281,6 +284,11 @@ class Writer:
             "video_path": VIDEO_PATH if any(f["dtype"] == "video" for f in self.features.values()) else None,
             "features": self.features,
         }  # fmt: skip
+
+
+def _without_padding(of_episode: Mapping[str, stats.Summary], counts: Mapping[str, int]) -> dict[str, stats.Summary]:
+    """The statistics of an episode without those of observations that it has no reading of."""
+    return {name: it for name, it in of_episode.items() if is_outcome(name) or counts.get(name) != 0}
 
 
 def _merge_tables(tables: Sequence[Path], at: Mapping[str, int]) -> None:

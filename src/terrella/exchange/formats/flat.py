@@ -27,6 +27,7 @@ SPELLINGS = {  # `rollouts.write` uses the first
 NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in spellings}
 NEXT = ("next_observations", "next_observation", "next_obs")
 _LAST, _FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
+_STEP_TYPE, _LAST_STEP = "step_type", 2  # of dm_env
 _ENDS = (
     "episode_ends",
     "traj_ends",
@@ -169,6 +170,8 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             ends[:-1] |= np.diff(array.read(0, count).reshape(-1)) != 0
         elif rowwise and head in _FIRST:
             ends[:-1] |= array.read(0, count).reshape(-1)[1:].astype(bool)
+        elif rowwise and head == _STEP_TYPE:
+            flags |= array.read(0, count).reshape(-1) == _LAST_STEP
         elif rowwise and (head in _LAST or NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)):
             flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
     return ends if ends.any() else flags
