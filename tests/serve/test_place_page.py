@@ -23,6 +23,7 @@ from terrella.workflows.splat_places import compared_scene, unedited_scene
 from terrella.worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import checked_edits, merge_edit, read_edits, save_splat, write_edits
 
+from ..space.test_edits import POST, standing
 from ..space.test_fitting import LENS, SIZE, room
 from .test_page import until as within
 
@@ -148,6 +149,26 @@ def test_edits_do_on_the_page_what_they_do_in_python(tmp_path, opened):
         ).max() < off
     page.evaluate("() => { for (let k = 0; k < 6; k += 1) terrella.story.undo(); }")
     assert np.array_equal(rows(page.evaluate(COLUMNS)["means"]), rows(place.gaussians.means))
+
+
+def test_surfaces_go_on_on_the_page_as_in_python(tmp_path, opened):
+    place = standing()
+    starts = world(1).starts
+    save_splat(
+        SplatWorld("post", place, torch.ones(len(place), dtype=torch.uint8), starts, SplatConfig(LENS, SIZE)),
+        tmp_path / "w",
+    )
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page, edits = opened((tmp_path / "place.html").as_uri()), [{**POST, "do": "move", "by": [0.0, 0.0, 3.0]}]
+    page.evaluate("edits => { terrella.story.replay(edits); }", edits)
+    there, here = page.evaluate(COLUMNS), apply_edits(place, edits)
+    assert len(here.gaussians) > len(place) + 30 and sum(there["seen"]) == int((here.origin >= 0).sum())
+    assert np.abs(rows(there["means"]) - rows(here.gaussians.means)).max() < 1e-6
+    theirs, mine = (np.asarray(one, np.float32).reshape(-1, 3) for one in (there["colours"], here.gaussians.colours))
+    orders = (
+        np.lexsort(np.asarray(one, np.float32).reshape(-1, 3).T) for one in (there["means"], here.gaussians.means)
+    )
+    assert (np.abs(theirs[next(orders)].clip(0, 1) - mine[next(orders)]).max(1) < 0.01).mean() > 0.999
 
 
 def merged(tmp_path, count: int, edits=()):

@@ -10,7 +10,9 @@ import torch
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, ContractError
 from terrella.library import load
-from terrella.space.edits import apply_edits
+from terrella.space.edits import apply_edits, select
+from terrella.space.raster import Gaussians
+from terrella.space.raster.gaussians import plain_sh
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import save_splat, world_of
 
@@ -60,6 +62,43 @@ def test_objects_and_brushes_are_selected():
     assert sorted(brush.gaussians.means[58:, 0].tolist()) == sorted(apart.gaussians.means[58:, 0].tolist())
     with pytest.raises(ContractError):
         apply_edits(scene, [{"select": {"object": 0}, "do": "delete"}], objects)
+
+
+def standing(sides: int = 4) -> Gaussians:
+    """A post on a floor that reaches beyond `sides` of the post's four sides, without a floor beneath it."""
+    rng = torch.Generator().manual_seed(3)
+    low = torch.tensor([0.0 if sides > 3 else 1.28, 0.0 if sides > 2 else 1.28, 0.0])
+    floor = low + torch.rand(4000, 3, generator=rng) * (torch.tensor([3.0, 3.0, 0.0]) - low)
+    floor = floor[~((floor[:, :2] > 1.28) & (floor[:, :2] < 1.62)).all(1)]
+    post = torch.tensor([1.3, 1.3, 0.05]) + torch.rand(300, 3, generator=rng) * torch.tensor([0.3, 0.3, 1.5])
+    means, count = torch.cat([floor, post]), len(floor) + 300
+    quats, scales = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1), torch.tensor([0.03, 0.03, 0.002]).repeat(count, 1)
+    return Gaussians(means, quats, scales, torch.full((count,), 0.9), plain_sh(means / 3))
+
+
+POST = {"select": {"box": [1.29, 1.29, 0.02, 1.61, 1.61, 2.0]}}
+
+
+@pytest.mark.parametrize("deed", [{"do": "delete"}, {"do": "move", "by": [0, 0, 3]}, {"do": "turn", "degrees": 45}])
+def test_a_floor_goes_on_beneath_what_is_taken_away(deed):
+    place = standing()
+    done = apply_edits(place, [{**POST, **deed}])
+    kept = len(place) - (300 if deed["do"] == "delete" else 0)
+    new, origin = done.gaussians.means[kept:], done.origin[kept:]
+    assert (
+        30 < len(new) < 100 and (origin == -1).all() and not done.objects.any()
+    )  # as dense as the floor: 444 a square metre
+    assert (new[:, 2].abs() < 1e-6).all() and new[:, :2].min() > 1.29 and new[:, :2].max() < 1.61
+    spots = 1.3 + 0.3 * torch.rand(200, 2, generator=torch.Generator().manual_seed(4))
+    assert torch.cdist(spots, new[:, :2]).amin(1).max() < 0.08
+
+
+def test_a_cut_a_hole_in_a_surface_and_a_paint_stay_as_they_are():
+    for place, edit in ((standing(2), {**POST, "do": "delete"}), (standing(), {**POST, "do": "recolour", "colour": [1, 0, 0]}),
+                        (standing(), {"select": {"sphere": [2.3, 2.3, 0, 0.3]}, "do": "delete"})):  # fmt: skip
+        done = apply_edits(place, [edit])
+        taken = int(select(place, edit, torch.zeros(len(place), dtype=torch.int32)).sum())
+        assert len(done.gaussians) == len(place) - (taken if edit["do"] == "delete" else 0)
 
 
 @pytest.mark.parametrize("radius", [0.5, 2.0])

@@ -12,7 +12,7 @@ through its origin, then moved; its objects are numbered after the first's:
 The page has the same edits (serve/web/place/edits.js). Both compute in double precision and store in single, so that they agree.
 
 Gaussians of the object -k are the surfaces beneath the object k: they are transparent until an edit moves, turns, scales or deletes
-a part of k."""
+a part of k. Where nothing lies beneath what is moved or deleted, the surfaces around it are continued (beneath.py)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +22,7 @@ from typing import Any, Protocol
 import torch
 
 from ..core.errors import ContractError
+from .beneath import beneath
 from .raster import Gaussians, join
 from .raster.gaussians import plain_sh
 from .raster.move import transform
@@ -70,6 +71,7 @@ def apply_edits(
     origin, known, raised = torch.arange(len(gaussians)), len(gaussians), []
     objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
     for edit in edits:
+        closed: list[Gaussians] = []
         if edit.get("do") == "merge":
             if other is None:
                 raise ContractError("a merge needs the other place; give `other`, which opens it.")
@@ -82,6 +84,7 @@ def apply_edits(
             chosen = select(gaussians, edit, objects)
             if edit.get("do") in MOVING:
                 gaussians, objects = _revealed(gaussians, objects, objects[chosen])
+                closed = _closed(gaussians, objects, chosen, edit)
             done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
             fresh = torch.full((len(done),), -1)
         if edit["do"] == "duplicate":
@@ -91,10 +94,20 @@ def apply_edits(
             raise ContractError(f"'{edit['do']}' leads out of all numbers; take smaller ones.")
         if len(gaussians) + len(done) > MOST_GAUSSIANS:
             raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; add less.")
-        gaussians = join([gaussians.at(~chosen), done])
-        origin = torch.cat([origin[~chosen], fresh])
-        objects = torch.cat([objects[~chosen], belong[: len(done)]])
+        gaussians = join([gaussians.at(~chosen), done, *closed])
+        new = sum(len(part) for part in closed)
+        origin = torch.cat([origin[~chosen], fresh, torch.full((new,), -1)])
+        objects = torch.cat([objects[~chosen], belong[: len(done)], torch.zeros(new, dtype=torch.int32)])
     return Edited(gaussians, origin, objects, tuple(raised))
+
+
+def _closed(gaussians: Gaussians, objects: torch.Tensor, chosen: torch.Tensor, edit: Edit) -> list[Gaussians]:
+    """Copies of what lies around, which close the hole that the chosen leave in the surfaces beside them (beneath.py)."""
+    if next(iter(edit["select"])) in ("all", "plane"):
+        return []
+    taken, stay = gaussians.means[chosen].double(), (~chosen & (objects >= 0)).nonzero()[:, 0]
+    places, sources = beneath(gaussians.means[stay].double(), taken.amin(0), taken.amax(0))
+    return [replace(gaussians.at(stay[sources]), means=places.float())]
 
 
 def _revealed(gaussians: Gaussians, objects: torch.Tensor, touched: torch.Tensor) -> tuple[Gaussians, torch.Tensor]:

@@ -1,5 +1,6 @@
 // Edits, as in space/edits.py: positions are computed in double precision and stored in single.
 
+import { beneath } from './beneath.js';
 import { joined } from './scene.js';
 
 const MOST_OBJECTS = 65535, REVEALED = 0.99, MOVING = ['move', 'turn', 'scale', 'delete'];
@@ -41,8 +42,12 @@ export function edited(scene, edit, others) {
   if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
   if (!mask.count) throw new Error('nothing is selected there; choose another place.');
-  if (MOVING.includes(edit.do)) scene = revealed(scene, mask);
-  if (edit.do === 'delete') return scene.at(numbers(mask, 0));
+  let closed = (after) => after;
+  if (MOVING.includes(edit.do)) {
+    scene = revealed(scene, mask);
+    if (!('all' in edit.select || 'plane' in edit.select)) closed = closing(scene, mask);
+  }
+  if (edit.do === 'delete') return closed(scene.at(numbers(mask, 0)));
   if (edit.do === 'duplicate') {
     const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
     const fresh = highest(scene.objects) + 1, [dx, dy, dz] = single(by);
@@ -56,7 +61,16 @@ export function edited(scene, edit, others) {
   const after = scene.copy(), middle = middleOf(scene, mask);
   const change = { move: () => moved(after, single(by)), turn: () => turned(after, single(degrees)[0], middle, middle), scale: () => scaled(after, single(factor)[0], middle), recolour: () => recoloured(after, single(colour)) }[edit.do]();
   for (let k = 0; k < after.length; k += 1) if (mask[k]) { change(k); after.seen[k] = 0; }
-  return after;
+  return closed(after);
+}
+
+/** A function that adds to a scene what closes the hole that the selected leave in the surfaces beside them. */
+function closing(scene, mask) {
+  const { places, sources } = beneath(scene, mask), part = scene.at(sources);
+  places.forEach((place, k) => part.means.set(place, 3 * k));
+  part.seen.fill(0);
+  part.objects.fill(0);
+  return (after) => (places.length ? joined(after, part) : after);
 }
 
 /** The scene with the surfaces beneath the selected objects opaque, as parts of no object. */
