@@ -84,6 +84,8 @@ def model(timestep: float) -> SimpleNamespace:
         (Env(10, dt=0.1, n_substeps=10), 0.1, "its dt"),  # which counts them already
         (Env(25, sim_dt=0.002, decimation=20), 0.04, "its sim_dt x decimation"),
         (Env("30"), 1 / 30, "its render_fps"),
+        (Env(None, _timeStep=1 / 240, _actionRepeat=8), 1 / 30, "its _timeStep x _actionRepeat"),
+        (Env(25, sim=SimpleNamespace(dt=0.04)), 0.04, "its sim.dt"),
         (Env("12.5 Hz"), 0.08, "its render_fps"),
         (Env(np.array([15])), 1 / 15, "its render_fps"),
         (Env("fast"), None, "none; its render_fps, 'fast', is no rate"),

@@ -326,3 +326,16 @@ def test_a_text_is_kept_as_bytes(text):
     padded = text_to_bytes(text)
     assert padded.shape == (1024,) and bytes_to_text(padded) == text[:512]
     assert not text or np.array_equal(embed(text), embed(text))
+
+
+def test_a_channel_of_numbers_that_is_called_text_is_recorded_as_numbers(tmp_path):
+    adapter = Adapter(channels={"text": Channel(lambda env: np.full(3, env.steps, np.float32))})
+    world = GymnasiumWorld(gives(render=None), adapter=adapter)
+    record(world, Random(world.spec), tmp_path / "r", 4, make_rng(0))
+    dataset = Dataset(tmp_path / "r")
+    assert dataset.tasks == ("explore gym:Plain",) and dataset.episode(0)["observation.text"][:, 0].tolist() == [
+        0,
+        1,
+        2,
+        3,
+    ]

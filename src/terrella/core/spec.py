@@ -120,7 +120,8 @@ class Spec:
 
     @property
     def recorded(self) -> tuple[str, ...]:
-        """The channels that a recording holds and a policy sees: all but a mosaic, which follows from earlier pictures."""
+        """The channels that a recording holds and a policy sees: all but a mosaic, which follows from earlier pictures. A recording
+        holds `text` as the episode's task."""
         return tuple(name for name in self.channels if kind_of(name) != "mosaic")
 
     def check_channels(self, channels) -> None:

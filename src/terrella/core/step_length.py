@@ -24,12 +24,12 @@ _RATES = (
 )  # fmt: skip
 _PERIODS = ("control_timestep", "control_dt", "ctrl_timestep", "ctrl_dt", "step_dt")
 # The length of a step of the environment or of its physics; of its physics alone; and how many of these a step has.
-_STEPS = ("dt", "tau", "timestep", "time_step")
+_STEPS = ("dt", "tau", "timestep", "sim.dt")
 _PHYSICS = ("physics_dt", "sim_dt", "sim_timestep", "physics_timestep", "model.opt.timestep", "sim.model.opt.timestep")
 _COUNTS = (
-    "frame_skip", "frameskip", "n_substeps", "num_substeps", "substeps", "sim_steps", "decimation", "action_repeat",
+    "frame_skip", "n_substeps", "num_substeps", "substeps", "sim_steps", "decimation", "action_repeat",
 )  # fmt: skip
-_FRAMES = ("render_fps", "video.frames_per_second")
+_FRAMES = ("render_fps", "video.frames_per_second", "fps")
 _UNIT = re.compile(r"\s*(fps|hz)\s*$", re.IGNORECASE)
 _TRIAL_STEPS, _LONGEST_S = 3, 60.0
 
@@ -149,12 +149,12 @@ def _frame(env: gymnasium.Env) -> tuple[dict[str, float], list[str]]:
 
 
 def _positive(env: gymnasium.Env, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
-    """(name, number) of the attributes that are positive numbers, in small or capital letters."""
+    """(name, number) of the attributes that are positive numbers; frame_skip may be spelled _frameSkip or FRAME_SKIP."""
+    spelled = {name.replace("_", "").lower(): name for name in reversed(dir(env.unwrapped))}
     for name in names:
-        for spelled in (name, name.upper()):
-            if number := _number(_at(env, spelled)):
-                yield spelled, number
-                break
+        own = spelled.get(name.replace("_", ""), name)
+        if number := _number(_at(env, own)):
+            yield own, number
 
 
 def _at(env: gymnasium.Env, path: str) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.errors import DatasetError, TerrellaError
-from ..core.spec import Camera, Spec, dtype_of, kind_of, shape_of
+from ..core.spec import TEXT, Camera, Spec, dtype_of, kind_of, shape_of
 from .source import Sensor
 
 RGB, DEPTH, STATE, POSE = "observation.images.rgb", "observation.depth", "observation.state", "observation.pose"
@@ -76,7 +76,8 @@ def features_of(channels: Iterable[str]) -> dict[str, str]:
 def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:
     """channel -> Sensor, for all recorded channels of a world but those that its tasks hold; DatasetError for a channel that cannot
     be recorded."""
-    features = features_of(name for name in spec.recorded if "text" not in spec.channels or name not in OF_TASK)
+    has_task = spec.channels.get("text") == TEXT
+    features = features_of(name for name in spec.recorded if not (has_task and name in OF_TASK))
     return {name: _sensor(spec, name, spec.channels[name], feature) for name, feature in features.items()}
 
 

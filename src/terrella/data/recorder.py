@@ -108,7 +108,7 @@ class Recorder:
         """Adds one row; the observation has no batch axis (rgb uint8 [H, W, 3], depth metres [h, w], pose [7], ...). `action` is
         None for the terminal observation; `done` None repeats the row before; `time_s` as in `add_row`. The channel `text` becomes
         the instruction from this row on."""
-        if "text" in observation and "text" not in self.layout.channels:
+        if "text" in observation and feature_of("text") not in self.layout.sensors:
             if (text := bytes_to_text(observation["text"])) != self._text:
                 self.say(text)
             observation = {name: value for name, value in observation.items() if name not in OF_TASK}
