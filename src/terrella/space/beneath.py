@@ -8,7 +8,7 @@ import torch
 THICK_M = 0.15  # what is thinner is a part of a surface, and leaves a hole on purpose
 NEAR_M, FLAT_M = 0.06, 0.03  # a surface lies that near to an end of the box; its Gaussians that near to their median
 CELL_M, STRIP_M = 0.15, 0.3  # around the box, cells of this side in a strip of this width ...
-COVERED, SIDES = 0.6, 3  # ... of which a surface covers this share on so many of the four sides
+COVERED, SIDES = 0.6, 3  # ... of which a surface covers this share, on at least this many of the four sides
 LEAST_M, MOST_M, MOST_NEW = 0.01, 0.1, 10_000  # spacing of new Gaussians, and how many a surface gets
 
 
@@ -78,9 +78,9 @@ def _around(points, low, high) -> tuple[list[bool], float, int]:
     for k in range(2):
         for beyond in (points[:, k] < low[k], points[:, k] > high[k]):
             here = at[beyond & inside[:, 1 - k]].long()
-            found = len(here.unique(dim=0))
-            sides.append(found >= COVERED * 2 * float(cells[1 - k]))
-            area += found * CELL_M * float((high[1 - k] - low[1 - k]) / cells[1 - k])
+            filled = len(here.unique(dim=0))
+            sides.append(filled >= COVERED * 2 * float(cells[1 - k]))
+            area += filled * CELL_M * float((high[1 - k] - low[1 - k]) / cells[1 - k])
             many += len(here)
     return sides, area, many
 
