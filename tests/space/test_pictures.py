@@ -202,7 +202,7 @@ def test_help_that_is_absent_or_broken_is_left_out_by_name(tmp_path):
     ],
 )
 def test_names_of_other_machines(tmp_path, name, place):
-    saved(tmp_path, place, "masks/a.png", "depth/a.png")
+    saved(tmp_path, place, "masks/a.png", "depth/a.png", "images_8/A.jpg")
     listed(tmp_path, name)
     assert read_transforms(tmp_path).files == [tmp_path / place]
 

@@ -1,5 +1,6 @@
 """Pictures by the names that another tool wrote, perhaps on another machine or before a folder was moved."""
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,5 +57,8 @@ def _relocated(name: str, tails: dict[str, list[Path]], taken: set[Path | None])
     for first in range(len(parts)):
         files = [file for file in tails.get("/".join(parts[first:]), ()) if file not in taken]
         if files:
+            smaller = [re.fullmatch(r"images_(\d+)", file.parent.name) for file in files]  # nerfstudio's smaller copies
+            if all(smaller):
+                files = [min(files, key=lambda file: int(file.parent.name.removeprefix("images_")))]
             return files[0] if len(files) == 1 else None
     return None
