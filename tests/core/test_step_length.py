@@ -119,6 +119,13 @@ def test_a_computed_dt_counts_its_substeps():
     assert step_length(Robot(model=model(0.01), frame_skip=5)) == (0.05, "its dt")
 
 
+def test_a_wrapper_that_holds_actions_makes_longer_steps():
+    env = gymnasium.wrappers.MaxAndSkipObservation(gymnasium.make("CartPole-v1"), skip=3)
+    assert step_length(env) == (pytest.approx(0.06), "its tau, held 3 times by a wrapper")
+    env = gymnasium.wrappers.TimeLimit(gymnasium.wrappers.MaxAndSkipObservation(Env(30), skip=2), 9)
+    assert step_length(env) == (pytest.approx(1 / 15), "its render_fps, held 2 times by a wrapper")
+
+
 def test_an_environment_without_metadata_or_with_a_step_that_fails_has_a_length():
     env = Env(None, "time", 0.1, time=0.0)
     env.metadata = None

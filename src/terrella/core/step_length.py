@@ -29,6 +29,7 @@ _PHYSICS = ("physics_dt", "sim_dt", "sim_timestep", "physics_timestep", "model.o
 _COUNTS = (
     "frame_skip", "n_substeps", "num_substeps", "substeps", "sim_steps", "decimation", "action_repeat",
 )  # fmt: skip
+_HOLDS = ("skip", "frameskip", "actionrepeat")  # of wrappers, without underscores
 _FRAMES = ("render_fps", "video.frames_per_second", "fps")
 _UNIT = re.compile(r"\s*(fps|hz)\s*$", re.IGNORECASE)
 _TRIAL_STEPS, _LONGEST_S = 3, 60.0
@@ -44,7 +45,10 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
     the source of `step` repeats nothing. Without any of these, the frame.
     """
     frame, remark = _frame(env)
-    stated = {**_control(env), **_stepped(env, frame), **frame}
+    held, suffix = _held(env)
+    stated = {
+        f"{name}{suffix}": length * held for name, length in (_control(env) | _stepped(env, frame) | frame).items()
+    }
     measured = _measured(env)
     if not measured and not stated:
         return None, "; ".join(["none", *remark])
@@ -76,6 +80,16 @@ def _measured(env: gymnasium.Env) -> dict[str, float]:
         if steps and alike and 1e-5 < steps[0] < _LONGEST_S and (len(steps) > 1 or name in _SIMULATORS):
             return {f"clock `{name}`": float(f"{steps[0]:.6g}")}
     return {}
+
+
+def _held(env: gymnasium.Env) -> tuple[float, str]:
+    """(steps of the bare environment for which wrappers hold an action, ", held ... times" or "")."""
+    held, layer = 1.0, env
+    while isinstance(layer, gymnasium.Wrapper):
+        names = {name.replace("_", "").lower(): value for name, value in vars(layer).items()}
+        held *= next((count for name in _HOLDS if (count := _number(names.get(name)))), 1.0)
+        layer = layer.env
+    return held, f", held {held:g} times by a wrapper" if held > 1 else ""
 
 
 def _control(env: gymnasium.Env) -> dict[str, float]:
