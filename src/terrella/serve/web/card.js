@@ -22,6 +22,13 @@ function fill(list, name, value) {
 const time = (seconds) => (seconds < 90 ? `${Math.round(seconds)} seconds` : seconds < 5400 ? `${Math.round(seconds / 60)} minutes` : `${(seconds / 3600).toFixed(1)} hours`);
 const large = (count) => (count >= 1e6 ? `${(count / 1e6).toPrecision(2)} million` : count.toLocaleString('en'));
 
+/** Names, each once, with how many there are. */
+function counted(names) {
+  const many = new Map();
+  names.filter(Boolean).forEach((name) => many.set(name, (many.get(name) ?? 0) + 1));
+  return [...many].map(([name, count]) => (count > 1 ? `${count} × ${name}` : name)).join(', ');
+}
+
 /** What a person asks first, as [word, sentence]. */
 function plainly({ card, dt_s: dt, cameras, mapped }) {
   const frames = Number(String(card.data ?? '').match(/^([\d,]+) frames/)?.[1].replaceAll(',', ''));
@@ -33,7 +40,9 @@ function plainly({ card, dt_s: dt, cameras, mapped }) {
     ['Pictures', `${width} × ${height} pixels, ${Math.round(1 / dt)} steps a second`],
     ['Memory', card.keyframes ? `${large(card.keyframes)} views of the recording, and what you see on your way` : learned && !mapped ? 'its last pictures' : null],
     ['Never seen', card.keep_out ? 'A part of the map was kept out of training. What you see there is invented.' : null],
-    ['Usual error', card.uncertainty?.sure ? `${(100 * card.uncertainty.sure).toFixed(1)}% of full brightness, in a picture that it is sure of` : null],
+    ['Built from', card.text ? `the words “${card.text}”` : card.kind === 'splat' ? card.file : null],
+    ['In it', counted(card.kind === 'splat' && Array.isArray(card.objects) ? card.objects : [])],
+    ['Usual error', card.uncertainty?.sure && card.kind !== 'splat' ? `${(100 * card.uncertainty.sure).toFixed(1)}% of full brightness, in a picture that it is sure of` : null],
     ['Physics', card.physics],
   ].filter(([, words]) => words);
 }
