@@ -21,12 +21,13 @@ SIDEWAYS = {"viewport": {"width": 844, "height": 390}, "has_touch": True, "is_mo
 
 
 class Range(Panorama):
-    """A shooting range: every shot hits, and each of them costs 40 health."""
+    """A shooting range: every shot hits, and each of them costs 40 health. It has as many numbers as a page shows."""
 
     def __init__(self, **options):
         super().__init__(**options)
         space, keys = spaces.MultiBinary(7), {code: [*value, 0.0] for code, value in self.spec.keys.items()}
-        more = {"health": spaces.Box(0, 100, (), np.float32), "hit": spaces.Box(0, 1, (), np.bool_)}
+        event = spaces.Box(0, 1, (), np.bool_)
+        more = {"health": spaces.Box(0, 100, (), np.float32), "hit": event, "fallen": event}
         names = (*self.spec.action_names, "ATTACK")
         keys["Space"] = [0.0] * 6 + [1.0]
         card = {"kind": "learned", "what": "a range"}
@@ -48,7 +49,7 @@ class Range(Panorama):
     def _channel(self, state: State, name: str):
         if name == "health":
             return 100 - 40 * state["shots"]
-        if name == "hit":
+        if name in ("hit", "fallen"):
             return state["hit"] > 0
         return 100 - 40 * state["shots"] <= 0 if name == "done" else super()._channel(state, name)
 
