@@ -95,7 +95,7 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
         )
     name = " ".join(text.split())
     layout: dict[str, Any] = {
-        "name": name if len(name) <= 60 else f"{name[:57].rstrip()}...",
+        "name": name if len(name) <= 60 else f"{name[:58].rsplit(' ', 1)[0].rstrip(' ,')}...",
         "seed": seed,
         "rooms": [],
         "doors": [],
