@@ -284,6 +284,35 @@ def test_a_text_that_changes_within_an_episode_is_the_instruction_of_the_rows_th
     assert [text for _, text in take.facts["language"]] == ["left", "right"]
 
 
+def test_further_pictures_of_an_observation_are_cameras(tmp_path):
+    class Arm(Plain):
+        observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict(
+                    {"top": spaces.Box(0, 255, (24, 32, 3), np.uint8), "wrist": spaces.Box(0, 1, (3, 24, 32))}
+                ),
+                "spare": spaces.Dict({"wrist": spaces.Box(0, 255, (16, 18), np.uint8)}),
+                "uneven": spaces.Box(0, 255, (17, 18, 3), np.uint8),
+            }
+        )
+
+        def seen(self):
+            pixels = {"top": RGB, "wrist": RGB.transpose(2, 0, 1).astype(np.float32) / 255}
+            return {"pixels": pixels, "spare": {"wrist": GREY[:16, :18]}, "uneven": np.zeros((17, 18, 3), np.uint8)}
+
+    drawn = GymnasiumWorld(Arm)  # it renders a picture, too
+    check_world(drawn)
+    assert set(drawn.spec.channels) == {"rgb", "rgb.top", "rgb.wrist", "rgb.wrist_2", "uneven", "reward", "done"}
+    seen = drawn.render(drawn.start(1, make_rng(0)), ("rgb.wrist", "rgb.wrist_2"))
+    assert np.abs(seen["rgb.wrist"][0].numpy().astype(int) - RGB).max() <= 1 and (seen["rgb.wrist_2"] == 200).all()
+    small = GymnasiumWorld(type("Arm", (Arm,), {"render_mode": None}), size=(12, 16))
+    assert {name: space.shape for name, space in small.spec.channels.items() if "rgb" in name} == {
+        "rgb": (12, 16, 3), "rgb.wrist": (12, 16, 3), "rgb.wrist_2": (12, 16, 3)
+    }  # fmt: skip
+    record(small, Random(small.spec), tmp_path / "r", 4, make_rng(0))
+    assert {"observation.images.rgb", "observation.images.wrist"} <= set(Dataset(tmp_path / "r").cameras)
+
+
 @pytest.mark.parametrize("name", ["Blackjack-v1"])
 def test_an_observation_that_is_a_tuple_is_several_channels(name):
     world = GymnasiumWorld(name, rgb=False)

@@ -246,8 +246,8 @@ class GymnasiumWorld:
 
     def _row(self, observation, reward, terminated, truncated, info: Mapping) -> dict[str, np.ndarray]:
         row: dict[str, Any] = {name: part.read(observation, self._name) for name, part in self._parts.arrays.items()}
-        if "rgb" in row:
-            row["rgb"] = self._sized(row["rgb"])
+        for name in filter(lambda name: kind_of(name) == "rgb", row):
+            row[name] = self._sized(row[name]) if name == "rgb" else resized(row[name], self._size)
         if self._parts.text is not None:
             text = str(entry_at(observation, self._parts.text, self._name))
             row |= {"text": text_to_bytes(text), "instruction": embed(text)}
@@ -343,7 +343,7 @@ class GymnasiumWorld:
         return {*self._info, *(str(path).split(".")[1] for path in self._info_paths.values())}
 
     def _describe(self, facts: EnvironmentFacts, dt_s: float | None, left_out: Mapping[str, str]) -> Spec:
-        channels = {name: part.space for name, part in self._parts.arrays.items() if name != "rgb"}
+        channels = {name: part.shown(self._size) for name, part in self._parts.arrays.items() if name != "rgb"}
         channels |= {"reward": REWARD, "done": DONE}
         if self._parts.text is not None:
             channels |= {"text": TEXT, "instruction": INSTRUCTION}

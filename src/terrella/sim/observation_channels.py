@@ -34,6 +34,11 @@ class ObservationPart:
     space: spaces.Space
     form: str = ""  # layout of a picture: "hwc", "chw" or "hw"; "" for other arrays
 
+    def shown(self, size: tuple[int, int] | None) -> spaces.Space:
+        """The space of the channel; pictures are uint8 [H, W, 3], resized to `size` if that is given."""
+        picture = (*(size or _sides(self.space, self.form)), 3)
+        return spaces.Box(0, 255, picture, np.uint8) if self.form else self.space
+
     def read(self, observation: Any, name: str) -> np.ndarray:
         """The value; a picture becomes uint8 [H, W, 3]. TerrellaError where its shape differs from the space."""
         value = np.asarray(entry_at(observation, self.path, name))
@@ -65,8 +70,9 @@ class ObservationParts:
 
 def parts_of(space: spaces.Space, seen: Any, rgb: bool, drawn: bool, taken: Iterable[str] = ()) -> ObservationParts:
     """The channels of an observation, of which `seen` is one. Entries of nested Dicts and Tuples are channels of their own:
-    {"arm": {"pos": ...}} is "arm.pos". A picture among them becomes `rgb` if that is wanted and the environment renders none
-    itself (`drawn`). One text is that of the task. Names in `taken` belong to other channels."""
+    {"arm": {"pos": ...}} is "arm.pos". If pictures are wanted (`rgb`), one becomes `rgb` unless the environment renders one
+    itself (`drawn`), and others with even sides further cameras: {"pixels": {"wrist": ...}} is "rgb.wrist". One text is that of
+    the task. Names in `taken` belong to other channels."""
     parts, texts = ObservationParts({}), dict[Path, str]()
     reserved, used = {*_RESERVED, *taken}, set[str]()
     for path, inner, value in _leaves(space, seen):
@@ -83,10 +89,15 @@ def parts_of(space: spaces.Space, seen: Any, rgb: bool, drawn: bool, taken: Iter
         if large and "rgb" not in parts.arrays and (not drawn or name == "rgb" or not path):
             parts.arrays["rgb"] = ObservationPart(path, inner, form)
             continue
+        if large and not any(side % 2 for side in _sides(inner, form)):  # which H.264 can hold
+            name = next(f"rgb.{one}" for one in _numbered(name.rpartition(".")[2]) if f"rgb.{one}".lower() not in used)
+            used.add(name.lower())
+            parts.arrays[name] = ObservationPart(path, inner, form)
+            continue
         kind = kind_of(name)
         if {name, kind} & reserved or (kind in _FORMS and not _FORMS[kind](inner)):
             name = f"seen_{name}"
-        name = next(one for one in chain([name], (f"{name}_{n}" for n in count(2))) if one.lower() not in used)
+        name = next(one for one in _numbered(name) if one.lower() not in used)
         used.add(name.lower())
         parts.arrays[name] = ObservationPart(path, inner)
     names = sorted(texts, key=lambda path: str(path[-1]).lower() not in TASK_NAMES if path else False)
@@ -133,6 +144,17 @@ def _channel(path: Path) -> str:
     if not words or isinstance(path[0], int):
         words.insert(0, "observation")
     return ".".join(words)
+
+
+def _numbered(name: str) -> Iterator[str]:
+    """name, name_2, name_3, ..."""
+    return chain([name], (f"{name}_{number}" for number in count(2)))
+
+
+def _sides(space: spaces.Space, form: str) -> tuple[int, ...]:
+    """(height, width) of a space of pictures."""
+    shape = space.shape or ()
+    return shape[1:] if form == "chw" else shape[:2]
 
 
 def _kind(space: Any) -> str:
