@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+import terrella
 from terrella import library
 from terrella.cli import main
 from terrella.core.errors import TerrellaError
@@ -20,10 +22,12 @@ from terrella.data import Dataset
 from terrella.learn.recipes.video import TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
-from terrella.workflows.learn import held_to_real_time
+from terrella.workflows.learn import LearnConfig, held_to_real_time
 from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from terrella.workflows.learn_trial import Pace, forecast, time_environment
 from terrella.workflows.opening import EnvironmentConfig
+from terrella.workflows.results import changed_settings
+from terrella.workflows.results import command as command_line
 
 from .tiny import NAME
 
@@ -173,6 +177,33 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     assert library.folder_of(out) == out / "run" / "world" and (out / "run" / "newest.png").exists()
     assert main([*command(out), "--seed", "5"]) == 2
     assert "seed 0, not 5" in capsys.readouterr().err
+
+
+def test_a_world_that_is_being_learned_can_be_named_by_its_folder(tmp_path):
+    (tmp_path / "learn.json").write_text("{}")
+    with pytest.raises(TerrellaError, match="has no world yet"):
+        library.folder_of(tmp_path)
+    (tmp_path / "run" / "world").mkdir(parents=True)
+    (tmp_path / "run" / "world" / "world.json").write_text("{}")
+    assert library.folder_of(tmp_path) == tmp_path / "run" / "world"
+
+
+def test_commands_that_are_printed_can_be_pasted():
+    config = LearnConfig(minutes=3, out=Path("my worlds/it's"), environment=EnvironmentConfig(size=(64, 96)))
+    line = command_line("terrella", "learn", "gym:A-v1", **changed_settings(config))
+    assert shlex.split(line) == [
+        "terrella",
+        "learn",
+        "gym:A-v1",
+        "--minutes",
+        "3",
+        "--out",
+        "my worlds/it's",
+        "--size",
+        "64",
+        "96",
+    ]
+    assert changed_settings(terrella.PlanConfig(curve=False)) == {"no_curve": True}
 
 
 PACE = TrainingPace(setup_s=5.0, step_s=0.5, share=0.6)

@@ -4,11 +4,13 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from .. import library
 from ..core.world import World
 from ..serve import ServeConfig
 from ..workflows import play as workflow
 from ..workflows import start
 from ..workflows.opening import ControlsConfig
+from ..workflows.results import command, folder_name
 from .say import Host, Json, Port, Token, opened, say
 
 AnyWorld = Annotated[Positional[str | None], arg(metavar="WORLD")]
@@ -40,6 +42,9 @@ def play(
         opened(" and ".join(names), address, {"worlds": names}, json)
         if worlds[-1].spec.card.get("kind") == "splat":
             say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
+        elif name and "reward" in worlds[-1].spec.channels and not library.is_truth(name):
+            after = command("terrella", "train", "policy", out=f"runs/{folder_name(name)}-policy", **{"in": name})
+            say(f"After playing, train an agent in it: {after}")
 
     if name is None:
         start.start(config, controls, page, on_ready=begun, progress=say)

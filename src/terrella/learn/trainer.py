@@ -7,8 +7,10 @@ step under way ends, the run is saved and stops; the same command resumes exactl
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
+import os
 import signal
 import threading
 import time
@@ -29,6 +31,7 @@ from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 
 Report = Callable[[float, float, str], None]
 LOG_EVERY = 20  # steps
+BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 CPU = torch.device("cpu")
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -276,13 +279,17 @@ class Trainer:
             raise KeyboardInterrupt(f"{done}; the same command continues.")
 
     def time_steps(self, most_s: float) -> float:
-        """Seconds of a gradient step, timed after a first batch for about `most_s` at most. It changes the modules."""
-        self._step(0)
-        began, batches = time.monotonic(), 0
-        while not batches or (batches < 10 and time.monotonic() - began < most_s):
-            batches += 1
-            self._step(batches)
-        return (time.monotonic() - began) / (batches * self.strides)
+        """Seconds of a gradient step, timed for about `most_s` after a first one, by three at least. It changes the modules."""
+        began, ends = time.monotonic(), list[float]()
+        for step in itertools.count():
+            rng = np.random.default_rng([self.run.seed, step])
+            now = TrainStep(step, 0.0, self.device, rng, make_rng(step))
+            for loss in self.objective.losses(self.feed.batch(now), now):
+                self._descend(loss, step * self.strides)
+                ends.append(time.monotonic())
+                if len(ends) > 3 and (ends[-1] - began > most_s or len(ends) > 60):
+                    return (ends[-1] - ends[0]) / (len(ends) - 1)
+        raise AssertionError  # a feed never ends
 
     def _step(self, step: int) -> dict[str, float]:
         """One batch, and one gradient step for each of its losses in turn. Returns the means of the losses' parts."""
@@ -380,6 +387,12 @@ def half_precision(device: torch.device) -> torch.autocast:
 def _cpu_has_bf16() -> bool:
     """Whether in hardware: emulated by oneDNN it is 2.7 times slower than float32."""
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+
+
+def yield_cores() -> None:
+    """Sets PyTorch to one thread where other processes use all cores: its threads would wait for each other."""
+    if os.getloadavg()[0] > BUSY * (os.cpu_count() or 1):
+        torch.set_num_threads(1)
 
 
 def device_named(name: str) -> torch.device:

@@ -13,6 +13,7 @@ from ..data import Dataset, RecordOptions
 from ..data.recording import LONGEST
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
+from ..learn.trainer import yield_cores
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
@@ -130,6 +131,7 @@ class _Learning:
         spent = ", ".join(f"{text} {duration(schedule.spent[at])}" for at, text in _DID.items() if schedule.spent[at])
         if spent:
             progress(f"Continues in {schedule.folder}: {spent} so far.")
+        yield_cores()
         if RECORDING in schedule.facts:
             self._announce()
         with stage(f"learning {schedule.folder.name}", progress) as shown:

@@ -78,9 +78,9 @@ class LearnSchedule:
 
     @property
     def share_s(self) -> dict[str, float]:
-        """Seconds of each stage. Recording has an eighth, scoring a fifteenth (between one and ten minutes, at most a fifth);
+        """Seconds of each stage. Recording has an eighth, scoring a fifteenth (between one and ten minutes, at most an eighth);
         training has the rest."""
-        scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 5)
+        scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 8)
         recording = self.seconds / 8 + self.facts.get("trial_s", 0.0)
         recording = self.spent[RECORDING] if RECORDING in self.facts else recording
         training = self.seconds - recording - scoring - STARTING_S
