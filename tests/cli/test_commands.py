@@ -102,6 +102,11 @@ def test_every_command_is_in_the_help(capsys):
     assert help_of("data", capsys).count("terrella data ") == 6
 
 
+def test_the_package_runs_as_a_module():
+    run = subprocess.run([sys.executable, "-m", "terrella", "version"], capture_output=True, text=True)
+    assert run.stdout == f"terrella {terrella.__version__}\n", run.stderr
+
+
 def test_the_version_is_said(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"terrella {terrella.__version__}\n"

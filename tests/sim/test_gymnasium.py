@@ -338,7 +338,7 @@ def test_bad_requests_are_answered_in_one_sentence():
             GymnasiumWorld(name)
     with pytest.raises(TerrellaError, match="Gymnasium cannot make"):
         GymnasiumWorld("CartPole-v1", GymnasiumConfig(options={"no_such_option": 1}))
-    with pytest.raises(TerrellaError, match="FlattenObservation"):
+    with pytest.raises(TerrellaError, match="TransformObservation"):
         GymnasiumWorld(
             lambda: gymnasium.wrappers.TransformObservation(gymnasium.make("CartPole-v1"), lambda seen: (1,), GRAPH)
         )

@@ -67,7 +67,7 @@ def test_names_keys_rest_and_clock_are_the_environments_own():
     assert enum.action_names == ("turn_left", "turn_right", "stay") and enum.dt_s == 0.04
     assert enum.keys["ArrowLeft"] == [0] and enum.keys["ArrowRight"] == [1] and neutral_action(enum) == 2
     assert tables.keys == {"KeyI": [1], "KeyK": [2]} and tables.card["how"]["keys"] == "get_keys_to_action"
-    assert nothing.action_names == () and nothing.card["how"]["action names"] == "none"
+    assert nothing.action_names == () and nothing.card["how"]["action names"] == "without names"
 
 
 def test_pictures_of_any_form_and_the_parts_of_a_dictionary_are_seen():

@@ -51,7 +51,7 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
     }
     measured = _measured(env)
     if not measured and not stated:
-        return None, "; ".join(["none", *remark])
+        return None, "; ".join(["no rate is declared", *remark])
     chosen, seconds = next(iter((measured or stated).items()))
     others = {name: other for name, other in stated.items() if not math.isclose(other, seconds, rel_tol=0.02)}
     differing = [f"by its {name} it would be {1 / other:g}" for name, other in others.items()]

@@ -128,13 +128,13 @@ class GymnasiumWorld:
         own_name = own_name if repeat == 1 else f"{own_name}@{repeat}"
         self._name, self._repeat = config.name or own_name, repeat
         self._size, self._info = check_size(config.size), tuple(config.info_channels)
-        check_space(self._env.action_space, self._name)
+        check_space(self._env.action_space, self._name, "actions")
         renders = rgb and renders_pictures(self._env)
         with explained(self._name, "reset"):
             seen, info = self._env.reset(seed=0)
         self._parts = parts_of(self._env.observation_space, seen, rgb, renders, self._info)
         if not self._parts.arrays and not renders:
-            check_space(self._env.observation_space, self._name)
+            check_space(self._env.observation_space, self._name, "observations")
         self._snapshots, self._viewer = None, self._env
         texts_change = self._parts.text is not None  # with the episode, which a trial may not show
         if config.forkable or (config.forkable is None and not texts_change):

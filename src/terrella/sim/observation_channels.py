@@ -161,10 +161,11 @@ def _kind(space: Any) -> str:
     return "its space does not declare it" if space is None else f"a {type(space).__name__}"
 
 
-def check_space(space: spaces.Space, name: str) -> None:
-    """TerrellaError where values of the space are not one array."""
+def check_space(space: spaces.Space, name: str, what: str) -> None:
+    """TerrellaError where values of the space of its `what` (actions, observations) are not one array."""
     if not isinstance(space, _KNOWN_SPACES):
-        raise TerrellaError(f"{name} has the space {space}; wrap it so that it is one array (FlattenObservation).")
+        wrapper = f"gymnasium.wrappers.Transform{what.capitalize()[:-1]}"
+        raise TerrellaError(f"{name} has {what} of the space {space}; wrap it so that they are one array ({wrapper}).")
 
 
 def picture_form(space: spaces.Space) -> str:
