@@ -57,6 +57,8 @@ def test_a_name_is_a_file_and_never_an_address(tmp_path, monkeypatch, name):
     assert len(take.readings[RGB].values) == Dataset(f"{name}.set").length == 6
     assert abs(int(take.readings[RGB].values[5].mean()) - 80) < 6
     assert len(video_pictures(f"{name}/{name}.mp4", 3, 128)) == 3
+    (single,) = open_source(f"{name}/{name}.mp4").takes()
+    assert len(single.readings[RGB].values) == 6 and single.facts == {"file": name}
     assert [path.name for path in (tmp_path / f"{name}.films").iterdir()] == ["take_0.mp4"]
 
 

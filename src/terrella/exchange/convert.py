@@ -60,7 +60,7 @@ def open_source(path: str | Path, fps: float | None = None, episodes: int = 10, 
     """Opens a recording as a Source; its format is recognised.
 
     path: a LeRobot v3 folder (or its address, "hf://…", "s3://…"); an .mcap file or a folder of them; a Minari dataset; HDF5
-          as robomimic, D4RL or DIAMOND's Counter-Strike recordings; a folder of .npz rollouts, videos or images; or
+          as robomimic, D4RL or DIAMOND's Counter-Strike recordings; .npz rollouts, videos or images (a folder or a file); or
           "gym:ID" for `episodes` rollouts of random actions, drawn with `seed`.
     fps:  rows per second of images and rollouts, which may not store it; None for the format's default.
     DatasetError where there is no known recording.

@@ -16,7 +16,9 @@ CAMERA = f"{rows.IMAGES}{rows.CAMERA}"
 
 
 def takes_of(path: Path, suffixes: frozenset[str], what: str, deep: bool) -> dict[str, dict[str, list[Path]]]:
-    """Take -> camera -> its files, as `videos.read` describes (or, if `deep`, `images.read`)."""
+    """Take -> camera -> its files (of one file: one take), as `videos.read` describes (or, if `deep`, `images.read`)."""
+    if path.is_file():
+        return {path.stem: {rows.CAMERA: [path]}}
     if not path.is_dir():
         raise DatasetError(f"{path} is not a folder; name a folder of {what}.")
     here, folders = _listed(path, suffixes)
