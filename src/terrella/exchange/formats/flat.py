@@ -28,10 +28,8 @@ NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in
 NEXT = ("next_observations", "next_observation", "next_obs")
 _LAST, _FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
 _STEP_TYPE, _LAST_STEP = "step_type", 2  # of dm_env
-_ENDS = (
-    "episode_ends",
-    "traj_ends",
-)  # the row after the last one of each episode (or, if the very last is named, that one)
+# of each episode the row after its last one; its last one, where the very last row is named
+_ENDS = ("episode_ends", "traj_ends")
 _LENGTHS = ("episode_lengths", "traj_lengths")
 _NUMBERS = ("episode_index", "episode_id", "episode_ids", "traj_id", "traj_ids")  # of the episode of each row
 _FOLDERS = ("data", "meta")  # of diffusion policy's files
@@ -103,8 +101,6 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
     """
     count = _steps(stored)
     ends = np.zeros(count, bool) if whole else _ends(stored, count, where)
-    if count > 1 and ends[-2:].all() and not ends[-3:-2].any():
-        ends[-2] = False  # flagged at the last step and at the terminal observation
     stops = sorted({*(np.flatnonzero(ends) + 1).tolist(), count} - {0}) or [0]
     spans = list(zip([0, *stops[:-1]], stops))
     kept: dict[Place, Array] = {}
@@ -174,6 +170,8 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             flags |= array.read(0, count).reshape(-1) == _LAST_STEP
         elif rowwise and (head in _LAST or NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)):
             flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
+    if count > 1 and flags[-2:].all() and not flags[-3:-2].any():
+        flags[-2] = False  # flagged at the last step and at the terminal observation
     return ends if ends.any() else flags
 
 
