@@ -10,6 +10,7 @@ import torch
 from gymnasium import spaces
 
 from terrella.core import Spec, State
+from terrella.serve import server
 from terrella.serve.presentation import aims, drawn_by, outcome
 
 from .panorama import Panorama
@@ -190,3 +191,12 @@ def test_a_toast_never_covers_the_buttons(serve_world, open_page):  # noqa: F811
     page.wait_for_timeout(300)
     toast, deck = page.locator("#toast").bounding_box(), page.locator("#deck").bounding_box()
     assert toast["y"] + toast["height"] < deck["y"]
+
+
+def test_a_page_that_has_lost_its_server_shows_the_command_that_helps(serve_world, open_page, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(server, "starting_command", lambda: "terrella play doom-maze")
+    served = serve_world()
+    page = open_page(served.url)
+    served.server.should_exit = True
+    until(page, "terrella.state === 'away'")
+    assert page.text_content("#banner-command") == "terrella play doom-maze" and page.is_visible("#banner-command")

@@ -96,7 +96,7 @@ def prepared(
     }  # fmt: skip
     page = replace(page, record_in=str(config.record or ""))
     if page.seed is None:
-        page = replace(page, seed=0 if config.compare else first_seed(learned))
+        page = replace(page, seed=first_seed(worlds[0]))
     return worlds, page, options
 
 
@@ -127,12 +127,13 @@ def _drawing_s(world: World) -> float:
 
 
 def first_seed(world: World) -> int:
-    """The seed whose episode begins with a good view: that on a learned world's card, else of a few the one with the widest and
-    most varied view. 0 for other worlds."""
+    """The seed whose episode begins with a good view: that on a learned world's card, else, of a learned world or a running game
+    with depth, of a few the one with the widest and most varied view. 0 for other worlds."""
     named, spec = world.spec.card.get("seed"), world.spec
     if isinstance(named, int):
         return named
-    if spec.card.get("kind") not in ("learned", "latent") or "rgb" not in spec.channels:
+    game = not spec.forkable and "depth" in spec.channels
+    if not game and spec.card.get("kind") not in ("learned", "latent") or "rgb" not in spec.channels:
         return 0
     return max(range(FIRST_SEEDS), key=lambda seed: _variety(world, seed))
 
