@@ -10,13 +10,13 @@ from gymnasium import spaces
 from PIL import Image
 
 from terrella.care.doctor import examine
+from terrella.cli.record import described as describe
 from terrella.core import check_world, make_rng
 from terrella.core.errors import TerrellaError
 from terrella.core.instruction import bytes_to_text, embed, text_to_bytes
 from terrella.core.policy import Random
 from terrella.data import Dataset, RecordOptions, record
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumWorld
-from terrella.workflows.recording_facts import describe
 
 GREY = np.full((24, 32), 200, np.uint8)
 RGB = np.dstack([GREY, GREY // 2, GREY // 4])  # 200, 100, 50
