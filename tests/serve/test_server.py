@@ -20,7 +20,7 @@ from websockets.sync.client import connect
 from terrella.core.errors import ServeError
 from terrella.serve import http_server, serve
 from terrella.serve.guard import RateLimit, is_loopback, refusal
-from terrella.serve.http_server import open_port
+from terrella.serve.http_server import open_port, starting_command
 from terrella.serve.server import ServeConfig
 
 from .panorama import Panorama, SlowDream
@@ -383,3 +383,17 @@ def test_a_closed_tab_lets_another_record(serve_world):
             break
         time.sleep(0.01)
     assert server.sinks[0].closed and server.sinks[0].ends == 1, "long before the session itself is given up"
+
+
+@pytest.mark.parametrize(
+    ("program", "command"),
+    [
+        (["/usr/lib/terrella/__main__.py", "play", "my hall"], "terrella play 'my hall'"),
+        (["/usr/bin/pytest", "-q"], ""),
+        (["bin/terrella", "play", "--port", "1"], "bin/terrella play --port 1"),
+    ],
+)
+def test_pages_get_the_command_that_started_their_server(program, command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", program)
+    assert starting_command() == command

@@ -170,6 +170,10 @@ def test_marks_survive_a_reload_and_are_left_out_of_the_export(open_view, tmp_pa
     until(page, READY)
     assert page.evaluate("[viewer.episode, viewer.bad]") == [1, [1]], "and the episode is still the one that was open"
     assert page.locator("#mark").get_attribute("aria-pressed") == "true"
+    page.route("**/mark?*", lambda route: route.abort())  # as where the server has stopped
+    page.locator("#mark").click()
+    until(page, "document.getElementById('toast').textContent.includes('server has stopped')")
+    page.unroute("**/mark?*")
     page.click("[data-which=good]")
     assert page.evaluate("viewer.listed") == [0, 2, 3]
     page.click("#export")
