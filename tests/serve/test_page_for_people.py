@@ -184,6 +184,31 @@ def test_nothing_lies_on_anything_on_a_phone(serve_world, open_page, screen):  #
             assert apart or one["bottom"] <= two["top"] + 1 or two["bottom"] <= one["top"] + 1, (name, other)
 
 
+class ManyJoints(Robot):
+    """A robot with eight motors of 150 N m."""
+
+    def __init__(self):
+        super().__init__("torque")
+        names = tuple(f"{joint}_{leg}" for leg in "1234" for joint in ("hip", "ankle"))
+        self.spec = replace(
+            self.spec, action=spaces.Box(-1, 1, (8,)), action_names=names, action_units=("150 N m",) * 8, keys={}
+        )
+
+    def imagine(self, state, action, rng):
+        return state
+
+
+def test_eight_sliders_are_seen_on_a_phone_in_their_own_units(serve_world, open_page):  # noqa: F811
+    page = open_page(serve_world([ManyJoints()]).url, **PHONE)
+    room = page.locator("#axes").bounding_box()
+    for label in page.locator("#axes label").all():
+        box = label.bounding_box()
+        assert box["y"] >= room["y"] and box["y"] + box["height"] <= room["y"] + room["height"] + 1
+    assert page.locator("#axes b").first.text_content() == "hip 1"
+    assert page.locator("#axes output").first.text_content() == "0 N m"
+    assert page.locator("#axes i").first.text_content() == "−150150"
+
+
 def test_a_toast_never_covers_the_buttons(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Panorama(forkable=False)]).url)
     page.keyboard.press("Backspace")

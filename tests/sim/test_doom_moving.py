@@ -15,6 +15,7 @@ pytest.importorskip("vizdoom", reason="ViZDoom is not installed: pip install viz
 
 from terrella.sim.doom import BUTTONS, CAMERA, Doom, DoomConfig, map_origin
 from terrella.sim.doom_map import Sectors
+from terrella.space.camera import yaw
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +95,25 @@ def test_who_dies_has_no_health_left():
         assert seen["health"] > 0
     game.close()
     assert seen["done"] and seen["health"] == 0 and seen["reward"] < -50
+
+
+def test_shots_that_hit_and_who_falls_are_events():
+    game, rng = Doom(DoomConfig(scenario="deadly_corridor")), make_rng(0)
+    state, hits, fallen = game.start(1, rng), 0, 0
+    for _ in range(80):
+        seen = game.render(state, ("objects", "pose", "hit", "fallen", "done"))
+        hits, fallen = hits + int(seen["hit"]), fallen + int(seen["fallen"])
+        if seen["done"]:
+            break
+        listed = seen["objects"][0][seen["objects"][0, :, 0] > 0]
+        apart = (listed[:, 1:3] if len(listed) else torch.ones(1, 2)) - seen["pose"][0, :2]
+        nearest = apart[apart.norm(dim=1).argmin()]
+        turn = float(torch.atan2(nearest[1], nearest[0]) - yaw(seen["pose"])[0] + torch.pi) % (2 * torch.pi) - torch.pi
+        state = game.imagine(
+            state, press(game, "TURN_LEFT" if turn > 0.06 else "TURN_RIGHT" if turn < -0.06 else "ATTACK"), rng
+        )
+    game.close()
+    assert hits >= 1 and hits >= fallen
 
 
 def test_a_frame_is_found_again_in_the_next_where_nothing_moves(maps):
