@@ -13,6 +13,7 @@ from terrella.core import check_world, make_rng
 from terrella.space.camera import planar_pose
 from terrella.space.occupancy import Walker
 from terrella.space.solids import Solids
+from terrella.workflows.splat_places import unedited_scene
 from terrella.worlds.folder import open_world
 from terrella.worlds.splat_folder import save_splat
 
@@ -111,6 +112,7 @@ def test_the_command_says_what_it_did_not_understand(tmp_path, capsys):
         main(["space", "build", "--text", "a tiny quux room", "--out", str(tmp_path / "w"), "--gaussians", "1000"]) == 0
     )
     assert "not understood: quux" in capsys.readouterr().out and (tmp_path / "w" / "layout.json").exists()
+    assert unedited_scene(str(tmp_path / "w")).note == "not understood: quux"
     for wrong in (["--text", "quux"], [], [str(tmp_path / "none.json")], ["--text", "room", "--gaussians", "3"]):
         assert main(["space", "build", *wrong, "--out", str(tmp_path / "no")]) != 0
         assert not (tmp_path / "no").exists() and len(capsys.readouterr().err.splitlines()) == 1

@@ -57,6 +57,7 @@ class PlaceScene:
     dt_s: float  # duration of a step
     names: Sequence[str] = ()  # of the objects 1, 2, ...
     other: Callable[[Edit], PlaceScene] | None = None  # opens the place that an edit merges
+    note: str = ""  # a sentence that the page shows when it opens
 
 
 class PlacePage:
@@ -90,7 +91,7 @@ class PlacePage:
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
-            "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside,
+            "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
             "command": starting_command() if save or watch or frames else "",
         }  # fmt: skip
         parts = {

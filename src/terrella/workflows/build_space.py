@@ -25,7 +25,7 @@ from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from ..worlds.splat_folder import save_splat, world_of
 from .progress import Progress, silent, stage
-from .splat_places import SpaceResult, page_scene
+from .splat_places import SpaceResult, page_scene, unheeded
 
 LAYOUT_FILE = "layout.json"
 MOST_NAMES = 20  # of what is left out on one line
@@ -150,17 +150,16 @@ def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResu
     if movable:
         without = "" if find_spec("mujoco") else " (once MuJoCo is installed: pip install 'terrella[mujoco]')"
         lines.append(f"can be pushed: {', '.join(movable)}{without}")
-    if parsed.unknown:
-        lines.append(f"not understood: {', '.join(parsed.unknown)}")
-    if parsed.left_out:
-        lines.append(f"no place was left for: {', '.join(parsed.left_out)}")
+    lines += unheeded(facts)
     return SpaceResult(facts, (*lines, f"walk in it: terrella play {out}"))
 
 
 def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildSpaceConfig) -> None:
     starts = place.starts.clone()
     starts[:, 2] += WALKER.eye_m
-    card = {"objects": list(place.names), **({"text": parsed.text} if parsed.text else {})}
+    card: dict[str, Any] = {"objects": list(place.names)}
+    if parsed.text:
+        card |= {"text": parsed.text, "not_understood": list(parsed.unknown), "no_place_for": list(parsed.left_out)}
     origin = torch.where(place.objects < 0, INVENTED, OBSERVED).to(torch.uint8)
     world = SplatWorld(
         parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,

@@ -61,8 +61,16 @@ def page_scene(
     collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
     return PlaceScene(
         source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
-        config.keep, config.dt_s, source.object_names, other,
+        config.keep, config.dt_s, source.object_names, other, "; ".join(unheeded(source.card)),
     )  # fmt: skip
+
+
+def unheeded(card: Mapping[str, Any]) -> list[str]:
+    """What of the words of a built place had no effect, in words; `card` is the place's."""
+    named = {"not understood": card.get("not_understood"), "no place was left for": card.get("no_place_for")}
+    return [
+        f"{what}: {', '.join(map(str, words))}" for what, words in named.items() if isinstance(words, list) and words
+    ]
 
 
 def unedited_scene(world: str) -> PlaceScene:

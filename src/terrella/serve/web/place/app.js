@@ -225,6 +225,7 @@ function run({ drawing, source, story, solid: first }) {
   seen.stands = world.count / source.length;
   take(story.scene);
   greet();
+  if (world.note && !world.edits.length) toast(`${world.note}.`);
   if (seen.stands > 1 && !world.watch) {  // who watches is given the newest whole
     $('edit').hidden = true;
     whole(source).then(async (all) => {
