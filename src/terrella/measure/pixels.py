@@ -41,7 +41,7 @@ LEAD = (
 )
 _MIN_SSIM = 11  # pixels, the window of SSIM
 _CHANGE_STEPS = 8  # over which changes are counted
-_FILM_SIDE = 256  # pixels; larger frames are thinned for the film
+_FILMS, _FILM_SIDE = 3, 256  # clips of which the liveliest is the film; pixels a side, beyond which frames are thinned
 
 
 def series(
@@ -72,8 +72,8 @@ def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     if of == ENDINGS:
         return []
     horizons = exam.config.horizons if of == CLIPS else ()
-    strips = max(0, exam.config.strips - first)
-    return [StepMetric((name,), _FrameMetrics(name, horizons, strips)) for name in exam.shared(world, "rgb")]
+    strips, films = max(0, exam.config.strips - first), max(0, _FILMS - first)
+    return [StepMetric((name,), _FrameMetrics(name, horizons, strips, films)) for name in exam.shared(world, "rgb")]
 
 
 @dataclass
@@ -83,6 +83,7 @@ class _FrameMetrics:
     name: str
     horizons: tuple[int, ...]
     strips: int  # frames to keep at each horizon
+    films: int  # frames to keep at each step
     before: torch.Tensor | None = None  # the frames of the step before
 
     def __call__(self, seen: Observation, clips: Sequence[Clip], row: int, step: int) -> Results:
@@ -93,7 +94,7 @@ class _FrameMetrics:
             kept[f"{name}/pooled"] = pooled(squared_error(mine, truth), changes(last, truth))
             kept[f"{name}/change"] = _count(changes(last if step == 1 or self.before is None else self.before, mine))
             self.before = mine
-            kept[f"{name}/film"] = _smaller(mine[: self.strips])
+            kept[f"{name}/film"] = _smaller(mine[: self.films])
         if step in self.horizons:
             if min(mine.shape[1:3]) >= _MIN_SSIM:
                 kept[f"{name}/ssim"] = ssim(mine, truth)
