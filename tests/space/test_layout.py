@@ -153,6 +153,7 @@ def kinds(text: str) -> tuple[Counter, tuple[str, ...]]:
         ("a study without windows or doors and a lamp", {"window": 0, "door": 0, "lamp": 1}, ()),
         ("a room with no window", {"window": 0}, ()),
         ("a hall with a row of pillars", {"pillar": 4}, ("row",)),
+        ("a hall with walls made of red brick and a table of marble", {"table": 1}, ()),
         ("a pair of chairs in a study", {"chair": 2, "room": 1}, ()),
         ("a kitchen with a dozen stools", {"stool": 12}, ()),
         ("a room with thirteen boxes", {"box": 13}, ()),
@@ -184,6 +185,13 @@ def test_sizes_of_openings_and_surfaces_are_seen():
     ]
     assert rooms[1].size[2] > 1.3 * rooms[0].size[2] and rooms[2].size[1] > 1.4 * rooms[0].size[1]
     assert parse_text("a room with a wide picture").layout.things[0].size[0] > 1.3  # type: ignore[index]
+
+
+def test_looks_may_follow_their_noun():
+    plan = parse_text("a hall with walls of dark red brick, a floor of stone and pillars made of marble").layout
+    assert (plan.rooms[0].walls, plan.rooms[0].floor) == ("dark red brick", "stone")
+    assert {thing.look for thing in plan.things} == {"marble"} and len(plan.things) == 4
+    assert parse_text("a room with a pillar and a red door").layout.things[0].look is None
 
 
 def test_what_is_too_much_is_named():

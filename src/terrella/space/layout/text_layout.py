@@ -54,7 +54,7 @@ _RELATIONS = {*_PLACES, *"next beside behind beyond near under above below over 
 _NONE = ("no", "without", "zero", "nor", "0")
 _BREAKS = {"with", "then", "but", *_NONE}  # adjectives do not reach over them
 _QUIET = {*"with and or but the of then there is are has have its it that which also plus through from into leads leading lead "
-          "another opens onto where stands stand side sides".split()}  # fmt: skip
+          "another made opens onto where stands stand side sides".split()}  # fmt: skip
 _THINGS = {*KINDS, "door", "window", "stairs"}
 _SIDELESS = {
     "door": ("middle", "corner"),
@@ -134,6 +134,7 @@ class _Reader:
         self.implied = False  # whether no word named the first room yet
         self.none = self.definite = self.placed = self.strange = False
         self.relation = ""  # the last preposition
+        self.noun, self.made_of = "", False  # the noun just read, and whether "of" followed it: "walls of red brick"
         self._forget()
         self.words: list[str] = re.findall(r"[a-z0-9#]+|[,;.:]", text.lower())[:400]
         for at, word in enumerate(self.words):
@@ -159,6 +160,8 @@ class _Reader:
 
     def _read(self, word: str) -> None:
         noun, following = _noun(word), self._word(1)
+        self.made_of = bool(self.noun) and (word == "of" or self.made_of and word in looks.WORDS)
+        self.noun = self.noun if self.made_of or word == "made" else ""
         if word in _BREAKS or (self.strange and word in ("and", ",", ";", ".", "a", "an")):
             self._drop()
         if word in _NONE:
@@ -179,6 +182,8 @@ class _Reader:
             more = SIZES[following if word == "very" else word]
             self.scale = (self.scale[0] * more[0], self.scale[1] * more[1], self.scale[2] * more[2])
             self.waiting.append(word)
+        elif self.made_of and word != "of":
+            self._made_of(word)
         elif word in looks.WORDS or re.fullmatch("#[0-9a-f]{6}", word):
             self.look.append(word)
             self.waiting.append(word)
@@ -191,6 +196,14 @@ class _Reader:
         ):
             self.unknown.append(word)
             self.strange = bool(self.waiting)
+
+    def _made_of(self, look: str) -> None:
+        """Adds a look to the surface or the thing just read."""
+        if self.noun in _SURFACES:
+            for room in self.here:
+                room.looks[self.noun] = f"{room.looks.get(self.noun, '')} {look}".strip()
+        elif self.last is not None:
+            self.last.look = f"{self.last.look} {look}".strip()
 
     def _word(self, ahead: int) -> str:
         return self.words[self.at + ahead] if 0 <= self.at + ahead < len(self.words) else ""
@@ -228,6 +241,7 @@ class _Reader:
         self.none = self.none and self._word(1) in ("or", "nor")
         self.placed, self.relation = False, ""
         self._forget()
+        self.noun = noun if noun not in ROOMS else ""
         return count
 
     def _room(self, noun: str, word: str) -> None:
