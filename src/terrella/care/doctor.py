@@ -178,7 +178,8 @@ def _padding(folder: Survey) -> Iterator[str]:
     for name, numbers in absent.items():
         if name in folder.features and name != DONE:
             where = f"{len(numbers)} of {len(folder.episodes)} episodes ({some_of(numbers)})"
-            yield f"{name} has no readings in {where}: their rows of it are padding, which training leaves out"
+            what = f"in {where}: their rows of it are padding, which training leaves out"
+            yield f"{name} has no readings {what if len(numbers) < len(folder.episodes) else 'at all: it is padding'}"
 
 
 def _unexamined(folder: Survey, rows: RowFacts) -> Iterator[str]:
