@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from .. import library
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
 from ..data import ClipCache, Dataset, check_game, split
+from ..data.training.cache import episodes_with
 from ..measure import (
     CLIPS,
     ENDINGS,
@@ -179,7 +182,9 @@ def exam_of(
         sources["new"] = (cache, every, in_box(*box))
     sets: dict[str, dict] = {CLIPS: {}, LONG: {}, ENDINGS: {}}
     going, rng, longest = {}, make_rng(seed), max(config.horizons)
-    for place, (source, episodes, where) in sources.items():
+    for place, (source, chosen, where) in sources.items():
+        needs = [source.keys.get(name, name) for name in (*world.spec.observes, "action")]
+        episodes = episodes_with(needs, np.asarray(chosen), source.absent).tolist()  # others hold padding
         sets[CLIPS][place] = clips_from_cache(source, episodes, CONTEXT, longest, request.clips, rng, where)
         drift_rng = make_rng(seed + 1)  # the other figures do not depend on whether drift is measured
         try:
