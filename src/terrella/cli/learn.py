@@ -21,7 +21,8 @@ def learn(
 ) -> None:
     """Learn a world of an environment, in one go: a script explores and records it, a world is trained on that, and scored.
 
-    Stop it at any time; the same command continues.
+    A trial of some seconds first says what the minutes will give. Stop it at any time; the same command continues. While it
+    trains, `terrella play` plays the newest state of the world.
 
     Args:
         name: The environment (gym:CarRacing-v3, gym:ALE/Breakout-v5, gym:PACKAGE:ID) or game (doom:my_way_home).

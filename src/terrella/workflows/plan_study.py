@@ -69,7 +69,7 @@ class PlanConfig:
     """Steps per episode at most; default: the environment's limit, else 200, or 30 s to walk to a place."""
     curve: bool = True
     """Whether to measure how much more compute helps. --no-curve: do not plan again with a half, a quarter, ... of --samples
-    or --budget-ms."""
+    or --budget-ms, which shows whether more compute helps."""
     out: Path | None = None  # Folder for the page, the film and plan.json; default: plans/ and the world's name.
     device: Device = "auto"
     seed: int = 0  # The same seed gives the same result.

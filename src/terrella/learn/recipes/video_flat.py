@@ -33,7 +33,7 @@ from .video_parts import VideoParts, flow_objective
 
 MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
-QUARTER, PAIRS = 0.25, 32  # and pairs at least; an eighth in a trial, a run of no hours
+QUARTER = 0.25
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE, MAX_STRESS = (
     0.4,
@@ -60,8 +60,7 @@ class CodecRecipe:
         plain = self.video.generator
         statistics = CodecStatistics.read(run.out, run.recipe)
         if statistics is None or statistics.over.shape != plain.size:
-            part = min(1.0, max(config.hours / QUARTER, 1 / 16)) if config.hours else 0.0
-            pixels = int(PAIR_PIXELS * part)
+            pixels = int(PAIR_PIXELS * min(1.0, max(config.hours / QUARTER, 1 / 16)))
             statistics = codec_statistics(recording, config.seed, pixels)
             statistics.write(run.out, run.recipe)
         sizes = len(statistics.moves), len(statistics.palette)
@@ -169,9 +168,7 @@ def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS)
     rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
     change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
-    most = max(
-        PAIRS if pixels else PAIRS // 8, pixels // before[0, 0].numel()
-    )  # pairs: each is matched at 625 displacements
+    most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
     some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
     moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
     over = overlay(before, after, F.pad(moves, (0, 0, 1, 0)))
