@@ -124,6 +124,36 @@ def test_takes_are_collected_one_by_one():
     takes.close()
 
 
+class Words(gymnasium.Space):
+    """Texts that are no spaces.Text, as MiniGrid's missions."""
+
+    def __init__(self):
+        super().__init__(dtype=str)
+
+
+class Guided(Arm):
+    """An arm with a sentence under a name of its own, and with crowds of any size."""
+
+    def __init__(self):
+        super().__init__(4)
+        parts = {
+            "pos": self.observation_space["arm"]["pos"],
+            "order": Words(),
+            "crowd": spaces.Sequence(spaces.Discrete(2)),
+        }
+        self.observation_space = spaces.Dict(parts)
+
+    def _seen(self):
+        return {"pos": super()._seen()["arm"]["pos"], "order": "turn left", "crowd": (0,) * self.step_count}
+
+
+def test_a_constant_text_is_the_task_and_what_is_no_array_is_named():
+    source = environments.from_env(Guided, episodes=1)
+    (take,) = source.takes()
+    assert take.task == "turn left" and "texts" not in take.facts
+    assert set(source.sensors) > {"observation.pos"} and sum("observations/crowd" in note for note in source.notes) == 1
+
+
 def test_what_is_no_environment_is_said():
     with pytest.raises(DatasetError, match="NoSuchThing-v0"):
         environments.from_env("NoSuchThing-v0")
