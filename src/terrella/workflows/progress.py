@@ -32,12 +32,19 @@ def stage(name: str, progress: Progress) -> Iterator[Report]:
         yield _lines(name, progress)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn
     from rich.progress import Progress as Bars
+    from rich.table import Column
 
-    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%")
-    times = TimeElapsedColumn(), TextColumn("{task.fields[left]}")
-    with Bars(*columns, *times, TextColumn("{task.fields[text]}"), console=Console(stderr=True)) as bars:
+    rest = Column(ratio=1, no_wrap=True)  # the text has the width that the others leave
+    whole = [Column(no_wrap=True, min_width=width) for width in (12, 4, 12)]
+    columns = TextColumn("{task.description}"), BarColumn(12, table_column=whole[0])
+    times = (
+        TextColumn("{task.percentage:>3.0f}%", table_column=whole[1]),
+        TextColumn("{task.fields[left]}", table_column=whole[2]),
+    )
+    text = TextColumn("{task.fields[text]}", table_column=rest)
+    with Bars(*columns, *times, text, console=Console(stderr=True), expand=True) as bars:
         task = bars.add_task(name, total=None, text="", left="")
 
         def report(done: float, total: float, text: str = "", left_s: float | None = None) -> None:
