@@ -402,6 +402,7 @@ def test_record_then_look(capsys, tmp_path):
     assert main(arguments) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["frames"] == 40 and facts["world"] == "gym:CartPole-v1"
+    assert facts["next"] == f"terrella train video {tmp_path / 'set'} --out runs/set"
     assert (tmp_path / "set" / "look.jpg").stat().st_size > 0
     assert main(arguments) == 0, "a finished recording is left as it is"
     assert json.loads(capsys.readouterr().out)["frames"] == 40
