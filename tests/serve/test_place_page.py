@@ -316,6 +316,7 @@ def test_a_place_of_200_000_is_walked_in_edited_and_taken_home(tmp_path, opened,
     page.evaluate("terrella.stand([2, 2, 1.6], 0.3, -0.3)")
     until(page, "terrella.idle")
     page.keyboard.press("KeyE")
+    page.evaluate("document.querySelector('[data-tool=sphere]').click()")
     page.mouse.move(250, 30)  # above the panel
     page.mouse.down()
     page.mouse.move(262, 30, steps=3)
@@ -450,6 +451,10 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     )
     page = opened(url)
     page.keyboard.press("KeyE")
+    page.mouse.move(250, 30)  # a drag that begins with a click on an object, or on none, does nothing more
+    page.mouse.down()
+    page.mouse.move(262, 30, steps=3)
+    page.mouse.up()
     for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
         page.locator(f"#merging input[aria-label={label}]").fill(value)
     page.click("#merge")

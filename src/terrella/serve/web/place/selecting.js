@@ -16,7 +16,7 @@ export class Selecting {
 
   handle(name, event) {
     if (name === 'down') return this.down(event);
-    if (name === 'drag' && this.doing) this.drag(event);
+    if (name === 'drag' && this.doing && this.doing.does !== 'nothing') this.drag(event);
     if (name === 'up' && this.doing) this.up();
     return false;
   }
@@ -52,7 +52,7 @@ export class Selecting {
     } else if (does === 'brush') {
       const hit = pick(this.on.scene(), eye.place, way), last = this.doing.dabs.slice(-4);
       if (hit && Math.hypot(...hit.place.map((part, a) => part - last[a])) > 0.4 * this.radius) this.dab(hit.place);
-    } else if (does !== 'nothing') this.grow(Math.max(LEAST, Math.hypot(...there.map((part, a) => part - from[a]))));
+    } else this.grow(Math.max(LEAST, Math.hypot(...there.map((part, a) => part - from[a]))));
   }
 
   up() {
