@@ -243,6 +243,13 @@ def _network(kind: type) -> Make:
     return lambda config, weights, remembered: load_weights(kind(config), weights)
 
 
+def _uncertainty(config: UncertaintyConfig, weights: Tensors, remembered: Tensors) -> UncertaintyNetwork:
+    """Of an older world without a ceiling: the largest error that it was calibrated to, and the usual drift."""
+    network = UncertaintyNetwork(config)
+    older = {"ceiling": weights["meant"][-1], "drift": network.drift}
+    return load_weights(network, {**older, **weights})
+
+
 def _weights(name: str, part: Any) -> Tensors:
     """The tensors of a part, its weights in half precision where that is enough."""
     network = part.motion if name == "body" and part else part
@@ -279,7 +286,7 @@ KINDS: dict[str, dict[str, tuple[type, Make]]] = {
         "constant": (ConstantConfig, lambda config, weights, _: ConstantOutcome(config)),
         "frames": (OutcomeConfig, _network(FrameOutcome)),
     },
-    "uncertainty": {"network": (UncertaintyConfig, _network(UncertaintyNetwork))},
+    "uncertainty": {"network": (UncertaintyConfig, _uncertainty)},
     "estimator": {"network": (EstimatorConfig, _network(Estimator))},
 }
 

@@ -31,7 +31,7 @@ from .localisation import NoEstimator
 from .objects import NoObjects
 from .outcome import ConstantConfig, ConstantOutcome
 from .parts import NOISE, Body, Evidence, Generator, Objects, Outcome, Scene, Uncertainty, newest_frame
-from .uncertainty import GONE, NoUncertainty, drift
+from .uncertainty import GONE, Expected, NoUncertainty, drift
 
 PATIENCE = 4096  # steps after which a frame is drawn though nobody reads it: what it waits for is kept in memory
 
@@ -77,7 +77,7 @@ class LearnedWorld:
         self.estimator: Any = _finished(estimator or NoEstimator())
         self.history = max(self.body.history, scene.history)
         self.size = scene.config.size
-        self._drawn_names = (*scene.drawn_names, "uncertainty")
+        self._drawn_names = (*scene.drawn_names, *Expected._fields)
         self.spec = self._spec()
 
     # -- what it is ---------------------------------------------------------------------------------------------------
@@ -264,7 +264,7 @@ class LearnedWorld:
         batch, device = evidence.batch, self.device
         known |= self.objects.observe(prior, evidence, observation, self.scene.camera)
         known["gone"] = torch.zeros(batch, len(GONE), device=device)
-        known["uncertainty"] = torch.zeros(batch, device=device)
+        known |= {name: torch.zeros(batch, device=device) for name in Expected._fields}
         if "actions" in evidence.seen:
             known["actions"] = evidence.seen["actions"]
         elif prior is None:
@@ -290,20 +290,13 @@ class LearnedWorld:
         after = before.replace(**{name: tensor for name, tensor in now.items() if name not in ("seeds", "still")})
         conditioning = self.look(after, before)
         clean = self._generated(conditioning, now["seeds"])
-        expected = self._expected(after, conditioning, clean)
-        drawn = self.take(after, before, conditioning, clean).replace(uncertainty=expected)
+        expected = self.uncertainty.expected(conditioning, clean, after["gone"])
+        drawn = self.take(after, before, conditioning, clean).replace(**expected._asdict())
         return {name: _where(now["still"], before[name], drawn[name]) for name in self._drawn_names}
 
     def _generated(self, conditioning: Conditioning, seeds: torch.Tensor) -> torch.Tensor:
         noise = chance.normal(seeds, (4, *self.size), stream=NOISE)
         return generate(self.generator, noise, conditioning, self.generator.config.steps)
-
-    def _expected(self, state: State, conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
-        """The error [B] to expect of a frame `clean` that was drawn for `state`."""
-        gone, familiar = state["gone"], conditioning.familiar
-        assert familiar is not None
-        situation = torch.cat([gone[:, :4].clamp_max(128).log1p(), familiar], 1)
-        return self.uncertainty.expected(conditioning, clean, situation, gone[:, 4])
 
     def _judged(self, state: State, lone: torch.Tensor, seeds: torch.Tensor) -> State:
         """`state`, of pictures that came alone, with the error to expect, judged by what the world would draw there; `lone` [B]:
@@ -312,7 +305,8 @@ class LearnedWorld:
         nothing = torch.zeros(state.batch, 3, device=self.device)
         state = state.replace(gone=torch.cat([nothing, lone[:, None].float(), strange[:, None]], 1))
         conditioning = self.look(state, state)
-        return state.replace(uncertainty=self._expected(state, conditioning, self._generated(conditioning, seeds)))
+        expected = self.uncertainty.expected(conditioning, self._generated(conditioning, seeds), state["gone"])
+        return state.replace(**expected._asdict())
 
 
 def _finished(part: Any) -> Any:

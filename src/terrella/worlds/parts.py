@@ -193,11 +193,9 @@ class Uncertainty(WorldPart, Protocol):
     """The error to expect of a drawn frame."""
 
     def channels(self) -> Channels: ...
-    def expected(
-        self, conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor, strange: torch.Tensor
-    ) -> torch.Tensor:
-        """Expected mean absolute error of rgb, 0..1, float32 [B]. clean: the generator's frame; situation [B, S] and strange
-        [B]: see uncertainty.py."""
+    def expected(self, conditioning: Conditioning, clean: torch.Tensor, gone: torch.Tensor) -> Any:
+        """Expected mean absolute errors of rgb, 0..1 (uncertainty.Expected), float32 [B] each. clean: the generator's frame; gone
+        [B, len(GONE)]: the way since evidence (uncertainty.py)."""
 
 
 class Absent:

@@ -1,11 +1,13 @@
 """Uncertainty: the error that a world expects of the frame that it has just drawn, learned from its own dreams.
 
-From the conditioning, the frame and the way since the last evidence, a network predicts the mean absolute error of such frames.
+Two things make a frame differ from the truth. The picture is invented: from the conditioning and the frame a network predicts the
+error that it would have at the true place. And the position has drifted: with the way since the last evidence the error grows from
+there to a ceiling, what two random pictures of the world differ by.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 import torch
@@ -24,6 +26,7 @@ from .parts import Absent, Channels
 GONE = ("steps", "metres", "radians", "lone", "strange")
 SITUATION = len(GONE) - 1 + 2  # without the last, and with Conditioning.familiar
 INPUT_MAPS = 15  # maps that `input_maps` gives
+LONGEST = 128  # steps, metres and radians of a situation at most
 CELLS = 4  # side in pixels of a cell of those maps; errors are predicted in cells of twice that
 KNOTS = 17  # of the calibration
 
@@ -36,13 +39,23 @@ class UncertaintyConfig:
     channels: tuple[int, int] = (24, 40)  # of its maps
 
 
+class Expected(NamedTuple):
+    """Expected mean absolute errors of rgb, 0..1, [B] each: in all, and its two parts."""
+
+    uncertainty: torch.Tensor
+    drifted: torch.Tensor  # since the position has drifted
+    invented: torch.Tensor  # since the picture is invented
+
+
 @final
 class UncertaintyNetwork(nn.Module):
-    """The network, and a monotone calibration of its answer (isotonic regression on held-out dreams)."""
+    """The network, a monotone calibration of its answer (isotonic regression on held-out dreams), and how fast a position drifts."""
 
     kind = "network"
     sure: torch.Tensor  # the usual error where memory knows the place
     invents: torch.Tensor  # and where it does not
+    ceiling: torch.Tensor  # what two random pictures differ by
+    drift: torch.Tensor  # rates a step, metre and radian, and a power: see `drifts`
 
     def __init__(self, config: UncertaintyConfig):
         super().__init__()
@@ -58,6 +71,8 @@ class UncertaintyNetwork(nn.Module):
         self.register_buffer("meant", torch.linspace(0, 1, KNOTS))
         self.register_buffer("sure", torch.tensor(0.02))
         self.register_buffer("invents", torch.tensor(0.08))
+        self.register_buffer("ceiling", torch.tensor(1.0))
+        self.register_buffer("drift", torch.tensor([0.0, 0.0, 0.15, 0.6]))  # as in a maze
 
     @property
     def answers(self) -> torch.Tensor:
@@ -71,7 +86,9 @@ class UncertaintyNetwork(nn.Module):
 
     def channels(self) -> Channels:
         unit = "expected mean absolute error of the picture, intensity 0..1"
-        return Channels({"uncertainty": spaces.Box(0, 1, (), np.float32)}, {"uncertainty": unit})
+        units = {"uncertainty": unit, "drifted": f"{unit}, by a position that has drifted"}
+        units["invented"] = f"{unit}, by a picture that is invented"
+        return Channels({name: spaces.Box(0, 1, (), np.float32) for name in units}, units)
 
     def forward(self, maps: torch.Tensor, situation: torch.Tensor) -> torch.Tensor:
         """maps [B, INPUT_MAPS, h, w]; situation [B, S]. Returns the expected error of each cell, 0..1: [B, h/2, w/2]."""
@@ -80,31 +97,42 @@ class UncertaintyNetwork(nn.Module):
         x = F.silu(x + self.wider(x))
         return F.softplus(self.output(x)[:, 0]) + 1e-4
 
-    def expected(
-        self, conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor, strange: torch.Tensor
-    ) -> torch.Tensor:
-        """The calibrated mean absolute error of frames `clean` [B, 4, H, W] drawn from `conditioning`, intensity 0..1: [B]. In an
-        episode that began with a picture unlike the recordings (`strange` [B], 0..1) at least that of invention."""
-        learned = self.calibrated(self(input_maps(conditioning, clean), situation).mean((1, 2)))
-        return torch.maximum(learned, self.invents * strange)
+    def expected(self, conditioning: Conditioning, clean: torch.Tensor, gone: torch.Tensor) -> Expected:
+        """The error of frames `clean` [B, 4, H, W] drawn from `conditioning`, `gone` [B, len(GONE)] since evidence. In an episode
+        that began with a picture unlike the recordings it is at least that of invention."""
+        cells = self(input_maps(conditioning, clean), situation_of(placed(gone), conditioning))
+        invented = torch.maximum(self.calibrated(cells.mean((1, 2))), self.invents * gone[:, 4])
+        invented = torch.minimum(invented, self.ceiling)
+        drifted = (self.ceiling - invented) * self.drifts(gone)
+        whole = invented + drifted
+        if conditioning.evidence:  # what comes from its mosaic is not invented
+            unknown = F.avg_pool2d(
+                1 - conditioning.glimpse.known[:, None], 2 * CELLS, ceil_mode=True, count_include_pad=False
+            )
+            invented = whole * (cells * unknown[:, 0]).sum((1, 2)) / cells.sum((1, 2))
+        return Expected(whole, whole - invented, invented)
+
+    def drifts(self, gone: torch.Tensor) -> torch.Tensor:
+        """How much of the way to the ceiling the error of a frame is [B], by its steps, metres and radians since evidence."""
+        return 1 - torch.exp(-((gone[:, :3] @ self.drift[:3]).clamp_min(1e-9) ** self.drift[3]))
 
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
-        """Linear between the knots; in proportion beyond them."""
+        """Linear between the knots; in proportion beyond them, up to the ceiling."""
         answers, errors = self.answers, self.errors
         at = torch.searchsorted(answers, answer).clamp(1, KNOTS - 1)
         low, high = answers[at - 1], answers[at]
         share = ((answer - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
         inside = torch.lerp(errors[at - 1], errors[at], share)
         below, above = answer / answers[0].clamp_min(1e-6), answer / answers[-1].clamp_min(1e-6)
-        return (inside * below.clamp_max(1) * above.clamp_min(1)).clamp(0, 1)
+        return torch.minimum(inside * below.clamp_max(1) * above.clamp_min(1), self.ceiling)
 
 
 @final
 class NoUncertainty(Absent):
     """Of a world that expects no error."""
 
-    def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
-        return torch.zeros_like(strange)
+    def expected(self, conditioning, clean, gone) -> Expected:
+        return Expected(*torch.zeros_like(gone[:, :3]).unbind(1))
 
 
 @final
@@ -117,9 +145,9 @@ class UncertaintyProbe(Absent):
     def __bool__(self) -> bool:
         return True
 
-    def expected(self, conditioning, clean, situation, strange) -> torch.Tensor:
-        self.note(conditioning, clean, situation)
-        return torch.zeros_like(strange)
+    def expected(self, conditioning, clean, gone) -> Expected:
+        self.note(conditioning, clean, gone)
+        return NoUncertainty().expected(conditioning, clean, gone)
 
 
 def drift(before: State, after: State, led: bool) -> torch.Tensor:
@@ -133,6 +161,17 @@ def drift(before: State, after: State, led: bool) -> torch.Tensor:
         metres = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
         way = way + torch.stack([metres, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
     return torch.cat([steps, way, gone[:, 3:]], 1)
+
+
+def placed(gone: torch.Tensor) -> torch.Tensor:
+    """`gone` [B, len(GONE)] of a frame whose pose is right: neither metres nor radians from evidence."""
+    return torch.cat([gone[:, :1], torch.zeros_like(gone[:, 1:3]), gone[:, 3:]], 1)
+
+
+def situation_of(gone: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+    """The situation [B, SITUATION] that the network sees."""
+    assert conditioning.familiar is not None
+    return torch.cat([gone[:, :4].clamp_max(LONGEST).log1p(), conditioning.familiar], 1)
 
 
 def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:

@@ -10,8 +10,7 @@ from ...worlds.frame_history import FrameHistory
 from ...worlds.learned import LearnedWorld
 from ..moves import ground_of
 from ..recording import Recording
-from .stress import SHOWN, observed
-from .uncertainty import steps_ahead
+from .stress import SHOWN, observed, steps_ahead
 
 FOG_PX = 12  # see HistoryConfig
 WIDER = 1.5  # times the area of a picture that a ground must have

@@ -8,7 +8,6 @@ from ...core.state import State
 from ...worlds.codec import Codec
 from ...worlds.learned import LearnedWorld
 from ..recording import Recording
-from .uncertainty import steps_ahead
 
 # Powers of the weight by which the logits are corrected. With a small one objects are drawn where they are unlikely, with a large
 # one small objects fade.
@@ -18,6 +17,18 @@ SHOWN, STEPS, CLIPS = 8, (32, 16, 8, 4), 12  # observed frames, steps of a rollo
 FRAMES = CLIPS * (SHOWN + STEPS[0] * len(POWERS))  # drawn at most
 TOLERANCE = 0.115  # of the logarithm of errors, half a decibel: closer errors count as equal
 CHANGED = 8  # difference of 255 from the step before above which a pixel has changed
+
+
+def steps_ahead(recording: Recording) -> np.ndarray:
+    """For each row [N], the number of steps that can be rolled out from it: consecutive usable rows of its episode."""
+    fine = recording.usable & np.asarray(recording.cache.action_valid)
+    if recording.cache.done is not None:
+        fine &= ~np.asarray(recording.cache.done)
+    last = np.append(recording.start[1:] != recording.start[:-1], True)
+    ends = np.flatnonzero(~fine | last)
+    rows = np.arange(len(fine))
+    end = ends[np.searchsorted(ends, rows)]
+    return np.where(fine, end - rows + fine[end], 0)
 
 
 def observed(

@@ -24,18 +24,28 @@ from ...core.files import replacing
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
-from ...worlds.uncertainty import CELLS, KNOTS, UncertaintyConfig, UncertaintyNetwork, UncertaintyProbe, input_maps
+from ...worlds.uncertainty import (
+    CELLS,
+    KNOTS,
+    UncertaintyConfig,
+    UncertaintyNetwork,
+    UncertaintyProbe,
+    input_maps,
+    situation_of,
+)
 from ..feeds import RandomBatches
 from ..recording import Recording
 from ..run_folder import resume_file
 from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
+from .drift import ceiling_of, drift_cost, drift_frames, drift_horizon, fit_drift
+from .stress import steps_ahead
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
 SHOWN = (1, 3, 10)  # numbers of recorded frames that a rollout may observe first
 DREAMT = "dreamt"  # the folder of the run that keeps them until the training is over
 MIN_HORIZON = 8  # steps of a rollout
-DREAMING = 0.6  # the part of the stage's time for rollouts; the rest is for training
+DREAMING, DRIFTING = 0.45, 0.2  # the parts of the stage's time for rollouts, short and long; the rest is for training
 _APART = 5  # every 5th episode is for calibration
 
 
@@ -92,12 +102,25 @@ def learn_uncertainty(
         half = torch.arange(len(half)) % 2 == 0
     calibrate(uncertainty, others.at(half))
     others = others.at(~half)
+    facts = calibrate_drift(run, world.replaced(uncertainty=uncertainty), recording, frames)
     expected = expected_error(uncertainty, others)
-    facts = {"sure": float(uncertainty.sure), "invents": float(uncertainty.invents), "frames": len(others.error)}
+    facts |= {"sure": float(uncertainty.sure), "invents": float(uncertainty.invents), "frames": len(others.error)}
     facts |= {"error": float(others.error.mean()), "expected": float(expected.mean())}
     facts["rank_correlation"] = rank_correlation(expected, others.error)
     shutil.rmtree(run.out / DREAMT, ignore_errors=True)
     return uncertainty, facts
+
+
+def calibrate_drift(run: Run, world: LearnedWorld, recording: Recording, frames: int) -> dict[str, float]:
+    """Sets the ceiling of the uncertainty of `world` and how fast its position drifts; these facts."""
+    network, horizon = world.uncertainty, drift_horizon(recording, frames)
+    assert isinstance(network, UncertaintyNetwork)
+    network.ceiling.fill_(ceiling_of(recording, run.seed))
+    network.invents.clamp_(max=0.6 * float(network.ceiling))
+    network.sure.clamp_(max=0.5 * float(network.invents))
+    limit_s = DRIFTING * run.budget.most_s("uncertainty")
+    fit_drift(network, drift_frames(world, recording, horizon, seed=run.seed, limit_s=limit_s))
+    return {"ceiling": float(network.ceiling), "drift_steps": horizon}
 
 
 def uncertainty_seconds(world: LearnedWorld, recording: Recording, frames: int) -> float:
@@ -113,7 +136,7 @@ def uncertainty_seconds(world: LearnedWorld, recording: Recording, frames: int) 
         now = TrainStep(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
         for loss in objective.losses(objective.sample(now), now):
             loss.value.backward()
-    return dreamt_s * frames + (time.monotonic() - began) * _steps(frames) / 3
+    return dreamt_s * (frames + drift_cost(world, recording, frames)) + (time.monotonic() - began) * _steps(frames) / 3
 
 
 def dreaming_seconds(world: LearnedWorld, recording: Recording, frames: int) -> float:
@@ -190,8 +213,8 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
     inputs: list[tuple[torch.Tensor, torch.Tensor]] = []
 
-    def note(conditioning: Conditioning, clean: torch.Tensor, situation: torch.Tensor) -> None:
-        inputs.append((input_maps(conditioning, clean).half().cpu(), situation.cpu()))
+    def note(conditioning: Conditioning, clean: torch.Tensor, gone: torch.Tensor) -> None:
+        inputs.append((input_maps(conditioning, clean).half().cpu(), situation_of(gone, conditioning).cpu()))
 
     def evidence(rows: np.ndarray) -> Observation:
         seen = recording.evidence(world.config, rows)
@@ -231,18 +254,6 @@ def _remembering(world: LearnedWorld, recording: Recording, begins, horizon: int
     return world.with_memory(world.memory.at(left))
 
 
-def steps_ahead(recording: Recording) -> np.ndarray:
-    """For each row [N], the number of steps that can be rolled out from it: consecutive usable rows of its episode."""
-    fine = recording.usable & np.asarray(recording.cache.action_valid)
-    if recording.cache.done is not None:
-        fine &= ~np.asarray(recording.cache.done)
-    last = np.append(recording.start[1:] != recording.start[:-1], True)
-    ends = np.flatnonzero(~fine | last)
-    rows = np.arange(len(fine))
-    end = ends[np.searchsorted(ends, rows)]
-    return np.where(fine, end - rows + fine[end], 0)
-
-
 class UncertaintyObjective:
     """The likelihood of errors of frames and cells under exponential distributions with the predicted means: it is the mean that is
     learned, not the median, and relative errors count, so that small errors matter as much as large ones."""
@@ -276,7 +287,7 @@ def fit_uncertainty(run: Run, seen: DreamFrames, steps: int) -> UncertaintyNetwo
         torch.manual_seed(run.seed)
         objective = UncertaintyObjective(UncertaintyNetwork(UncertaintyConfig(seen.situation.shape[1])), seen)
     trainer = Trainer(run, "uncertainty", RandomBatches(objective.sample), objective, steps, device=CPU)
-    trainer.limit_s *= 1 - DREAMING
+    trainer.limit_s *= 1 - DREAMING - DRIFTING
     trainer.train()
     return objective.uncertainty.eval().requires_grad_(False)
 
