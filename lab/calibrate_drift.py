@@ -3,8 +3,8 @@
     python lab/calibrate_drift.py doom-maze --data recordings/calibrate --test recordings/test --out worlds/doom-maze
 
 The table: for ten groups of frames of rollouts of 1,000 steps, ordered by the error that is expected, the mean of that and of the
-true error; then the same by steps. With --whole every frame of the test's rollouts is drawn, as in play. --everywhere also takes
-the rows that were kept out of the world's training.
+true error; then the same by steps. --everywhere also takes the rows that were kept out of the world's
+training.
 """
 
 import argparse
@@ -12,7 +12,6 @@ import argparse
 import torch
 
 import terrella
-from terrella.learn.objectives import drift
 from terrella.learn.objectives.drift import DriftFrames, ceiling_of, drift_frames, drift_horizon, fit_drift, reliability
 from terrella.learn.paired import open_paired
 from terrella.learn.recording import box_of
@@ -46,9 +45,8 @@ def main() -> None:
     parser.add_argument("--data", help="the recording to fit on; without it the world is checked as it is")
     parser.add_argument("--test", help="the recording to check on")
     parser.add_argument("--out", help="folder of the world with its drift")
-    parser.add_argument("--rollouts", type=int, default=12)
+    parser.add_argument("--rollouts", type=int, default=4)
     parser.add_argument("--everywhere", action="store_true")
-    parser.add_argument("--whole", action="store_true")
     asked = parser.parse_args()
     world = terrella.load(asked.world)
     box = None if asked.everywhere else box_of(world.about.card.get("keep_out"))
@@ -57,7 +55,7 @@ def main() -> None:
         recording = open_paired(plain, asked.data, box, lambda *_: None).recording
         network.ceiling.fill_(ceiling_of(recording, 0))
         horizon = drift_horizon(recording, 10**6)
-        frames = drift_frames(plain, recording, horizon, rollouts=asked.rollouts)
+        frames = drift_frames(plain, recording, horizon, asked.rollouts)
         fit_drift(network, frames)
         print(
             f"fitted on {asked.rollouts} rollouts of {horizon} steps: ceiling {network.ceiling:.3f}, drift",
@@ -65,11 +63,9 @@ def main() -> None:
         )
         show(network, frames)
     if asked.test:
-        if asked.whole:
-            drift.leaps = lambda _: False
         recording = open_paired(plain, asked.test, box, lambda *_: None).recording
         print("checked:")
-        show(network, drift_frames(plain, recording, drift_horizon(recording, 10**6), rollouts=asked.rollouts, seed=1))
+        show(network, drift_frames(plain, recording, drift_horizon(recording, 10**6), asked.rollouts, seed=1))
     if asked.out:
         facts = {**dict(world.about.card.get("uncertainty", {})), "ceiling": round(float(network.ceiling), 4)}
         save_world(world.replaced(card={"uncertainty": facts}), asked.out)

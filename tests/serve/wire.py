@@ -27,13 +27,15 @@ class Frame:
     client_ms: float = 0.0
     server_s: float = 0.0
     uncertainty: float = -1.0
+    drifted: float = 0.0
     vitals: tuple[float, ...] = ()
 
 
 def encode(frame: Frame) -> bytes:
     moment = Moment(
-        frame.step, frame.images, frame.flags, frame.episode_return, uncertainty=frame.uncertainty, vitals=frame.vitals
-    )
+        frame.step, frame.images, frame.flags, frame.episode_return, uncertainty=frame.uncertainty, drifted=frame.drifted,
+        vitals=frame.vitals,
+    )  # fmt: skip
     controls = HeldControls(frame.action_id, t=frame.client_ms)
     past = frame.oldest, frame.newest
     return protocol.encode_frame(moment, frame.seq, *past, controls, frame.generation_ms, frame.server_s)
@@ -43,7 +45,7 @@ def decode_frame(data: bytes) -> Frame:
     """What `encode_frame` wrote; ProtocolError where the bytes are cut short or of another version."""
     try:
         fields = protocol._HEADER.unpack_from(data)
-        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, uncertainty = fields
+        version, flags, count, seq, step, oldest, newest, action_id, made, score, client, server, *gauge = fields
         if version != protocol.VERSION:
             raise ProtocolError(
                 f"a frame of protocol version {version} came, this side speaks {protocol.VERSION}; reload the page."
@@ -60,5 +62,5 @@ def decode_frame(data: bytes) -> Frame:
     if at > len(data):
         raise ProtocolError(f"a frame of {len(data)} bytes should have {at}; reload the page.")
     return Frame(
-        seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, uncertainty, vitals
+        seq, step, oldest, newest, tuple(images), flags, action_id, made, score, client, server, *gauge, vitals
     )

@@ -34,7 +34,7 @@ from terrella.worlds.parts import (
     newest_frame,
 )  # fmt: skip
 from terrella.worlds.uncertainty import (
-    SITUATION,
+    Expected,
     NoUncertainty,
     UncertaintyConfig,
     UncertaintyNetwork,
@@ -284,6 +284,9 @@ def test_an_uncertainty_says_an_error_for_each_entry(made):
     before, after, _ = walked(world)
     shown = world.look(after, before)
     clean = world.generator(torch.randn(B, 4, *SIZE, generator=make_rng(0)), torch.zeros(B), shown)
-    expected = part.expected(shown, clean, torch.zeros(B, SITUATION), torch.tensor([0.0, 0.0, 1.0]))
-    assert expected.shape == (B,) and expected.dtype == torch.float32 and ((expected >= 0) & (expected <= 1)).all()
-    assert set(part.channels().shows) <= {"uncertainty"} and len(noted) == (made == "probe")
+    gone = torch.tensor([[1.0, 0, 0, 0, 0], [400.0, 90, 20, 0, 0], [1.0, 0, 0, 1, 1]])
+    whole, drifted, invented = part.expected(shown, clean, gone)
+    for expected in (whole, drifted, invented):
+        assert expected.shape == (B,) and expected.dtype == torch.float32 and ((expected >= 0) & (expected <= 1)).all()
+    assert torch.allclose(whole, drifted + invented) and (made in (NoUncertainty, "probe") or drifted[1] > drifted[0])
+    assert set(part.channels().shows) <= {*Expected._fields} and len(noted) == (made == "probe")

@@ -17,7 +17,8 @@ POSE_NAMES = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 MOST_LETTERS = 200
 NAME = re.compile(rf"\w[\w.-]{{0,{MOST_LETTERS}}}")  # valid name of a feature, which also names files and folders
 MOST_AXES = 5
-ESTIMATES = ("uncertainty", "known", "places", "keyframes", "hit", "fallen")  # of a learned world, so no training data
+# Of a learned world, so no training data.
+ESTIMATES = ("uncertainty", "drifted", "invented", "known", "places", "keyframes", "hit", "fallen")
 OF_TASK = ("text", "instruction")  # channels that an episode's task holds
 RENAMED = {"cast": "objects"}  # channel of old recordings -> its name now
 _MAIN = {"rgb": RGB, "depth": DEPTH, "pose": STATE, "reward": REWARD, "done": DONE, "observation": "observation"}

@@ -124,7 +124,7 @@ def _compared(exam: Exam, world: World) -> list[str]:
     if not shown:
         return []
     single = [name for name, array in shown[0].channels.items() if array[0].size == 1 and name in world.spec.channels]
-    return [name for name in single if not name.startswith("uncertainty")]
+    return [name for name in single if not name.startswith(("uncertainty", "drifted", "invented"))]
 
 
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:

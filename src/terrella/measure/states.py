@@ -21,7 +21,10 @@ LEAD = (
     "RMS error of each predicted vector, each number in units of its standard deviation in these recordings. R\u00b2 is the share "
     "of the variance that is predicted: 1 is all, 0 is no better than the mean."
 )
-NOT_VECTORS = ("rgb", "depth", "pose", "reward", "done", "uncertainty", "known", "keyframes", "text", "instruction")
+NOT_VECTORS = (
+    "rgb", "depth", "pose", "reward", "done", "uncertainty", "drifted", "invented", "known", "keyframes", "text",
+    "instruction",
+)  # fmt: skip
 
 
 def vectors(exam: Exam, world: World) -> list[str]:

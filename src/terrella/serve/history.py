@@ -29,6 +29,7 @@ class Moment:
     states: tuple[State, ...] | None = None
     rngs: tuple[torch.Tensor, ...] | None = None  # states of the random generators after this step
     uncertainty: float = -1.0  # expected error of the last image; -1 if its world has no such channel
+    drifted: float = 0.0  # the part of it that follows from a position that has drifted; the rest is invention
     vitals: tuple[float, ...] = ()  # numbers of the first world, such as the player's health
     age: int = 0  # steps since its episode began
 

@@ -68,14 +68,16 @@ def strip_of(pictures: torch.Tensor, height: int = 72) -> str:
     return base64.b64encode(data.getvalue()).decode()
 
 
-def uncertainty_levels(spec: Spec) -> tuple[float, float] | None:
-    """For a world with the channel `uncertainty`: its usual value, and the value above which most of the picture is invented."""
+def uncertainty_levels(spec: Spec) -> tuple[float, float, float] | None:
+    """For a world with the channel `uncertainty`: its usual value; that above which most of the picture is invented; and that by
+    drift above which the position is lost, half of what two random pictures of the world differ by."""
     if "uncertainty" not in spec.channels:
         return None
     card = spec.card.get("uncertainty")
     levels = card if isinstance(card, dict) else {}
-    sure, invents = (_share(levels.get(name), usual) for name, usual in (("sure", 0.02), ("invents", 0.08)))
-    return sure, max(invents, 1.01 * sure)
+    usual = ("sure", 0.02), ("invents", 0.08), ("ceiling", 0.2)
+    sure, invents, ceiling = (_share(levels.get(name), value) for name, value in usual)
+    return sure, max(invents, 1.01 * sure), ceiling / 2
 
 
 def _share(value: object, usual: float) -> float:

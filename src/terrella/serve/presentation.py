@@ -34,7 +34,7 @@ def aims(spec: Spec) -> bool:
 
 def numbers_of(spec: Spec) -> list[str]:
     """The channels that are single numbers, such as health, which the page shows beside the score."""
-    others = ("reward", "done", "uncertainty")
+    others = ("reward", "done", "uncertainty", "drifted", "invented")
     return [name for name, space in spec.channels.items() if space.shape == () and name not in others]
 
 

@@ -12,7 +12,7 @@ from .actions import MAX_AXES
 from .history import Moment
 from .keys import Rebound
 
-VERSION = 3
+VERSION = 4
 MAX_MESSAGE = 4096  # bytes of one message from a page
 MAX_PICTURE = 2**16 - 256  # bytes of a picture from a page, which are all that it sends as bytes
 GOAL_MARK = b"\x00"  # no image file begins with it
@@ -29,8 +29,9 @@ FRESH = 2  # first frame of an episode
 REPLAY = 4  # a frame out of the history: the session stands in the past
 
 # version u8, flags u8, images u16, seq u32, step u32, oldest u32, newest u32, action id u32,
-# generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32; little endian
-_HEADER = struct.Struct("<BBHIIIIIffddf")
+# generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32,
+# drifted f32; little endian
+_HEADER = struct.Struct("<BBHIIIIIffddff")
 _IMAGE = struct.Struct("<BBHI")  # world, camera, 0, bytes
 
 
@@ -72,7 +73,7 @@ def encode_frame(
     parts = [
         _HEADER.pack(
             VERSION, moment.flags, len(moment.images), seq & U32, moment.step, oldest, newest, controls.id, made_ms,
-            moment.episode_return, controls.t, server_s, moment.uncertainty,
+            moment.episode_return, controls.t, server_s, moment.uncertainty, moment.drifted,
         )
     ]  # fmt: skip
     for image in moment.images:

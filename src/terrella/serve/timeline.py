@@ -333,6 +333,7 @@ class Timeline:
             None if self.no_rewind else self._states,
             None if self.no_rewind else tuple(rng.get_state() for rng in self._rngs),
             float(last["uncertainty"][0]) if "uncertainty" in last else -1.0,
+            float(last["drifted"][0]) if "drifted" in last else 0.0,
             numbers,
             age,
         )
@@ -350,7 +351,7 @@ class Timeline:
     def _observed(self, number: int, draw: bool) -> Mapping[str, torch.Tensor]:
         """The channels of a world that are shown, its pictures if `draw`, and those that are recorded."""
         spec = self.worlds[number].spec
-        wanted = [*(self._shown_of(number).values() if draw else ()), "uncertainty"]
+        wanted = [*(self._shown_of(number).values() if draw else ()), "uncertainty", "drifted"]
         if number == 0:
             wanted += ["reward", "done", *numbers_of(spec), *(spec.recorded if self.recording.on else ())]
         names = tuple(dict.fromkeys(name for name in wanted if name in spec.channels))

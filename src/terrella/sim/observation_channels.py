@@ -19,7 +19,7 @@ _PIXELS = 16  # smallest side of a picture
 # Channels that mean something else than an array of the observation, and those of which it must have this form.
 _RESERVED = (
     "rgb", "reward", "done", "truncated", "numbers", "kinds", "ticket", "text", "instruction", "known", "places",
-    "keyframes", "mosaic", "uncertainty", "hit", "fallen",
+    "keyframes", "mosaic", "uncertainty", "drifted", "invented", "hit", "fallen",
 )  # fmt: skip
 _FORMS = {"depth": lambda space: len(space.shape) == 2, "pose": lambda space: space.shape == (7,)}
 

@@ -14,7 +14,9 @@ from ..core.world import Observation, World, make_rng
 REWARD = "reward"
 _PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
 _WILDCARDS = ("_", "any", "nan")
-_NO_STATE = ("reward", "done", "uncertainty", "truncated", "snapshot", "latent", "text", "instruction")
+_NO_STATE = (
+    "reward", "done", "uncertainty", "drifted", "invented", "truncated", "snapshot", "latent", "text", "instruction",
+)  # fmt: skip
 
 
 def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:

@@ -19,7 +19,8 @@ from .opening import EnvironmentConfig
 STEPS = 200  # of an episode, where the environment sets no limit
 _SIZE = re.compile(r"^[\d.e+-]+ ")  # 8 of "8 N m"
 _NOT_COMPARED = {
-    "snapshot", "reward", "done", "truncated", "uncertainty", "known", "places", "mosaic", "text", "instruction", "latent",
+    "snapshot", "reward", "done", "truncated", "uncertainty", "drifted", "invented",
+    "known", "places", "mosaic", "text", "instruction", "latent",
 }  # fmt: skip
 
 

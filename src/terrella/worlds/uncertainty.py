@@ -49,7 +49,7 @@ class Expected(NamedTuple):
 
 @final
 class UncertaintyNetwork(nn.Module):
-    """The network, a monotone calibration of its answer (isotonic regression on held-out dreams), and how fast a position drifts."""
+    """The network, a monotone calibration of its answer (isotonic regression on held-out dreams), and how a position drifts."""
 
     kind = "network"
     sure: torch.Tensor  # the usual error where memory knows the place

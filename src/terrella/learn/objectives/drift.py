@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ...core.state import State
 from ...core.world import make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
@@ -22,21 +21,19 @@ from .stress import observed, steps_ahead
 
 LONGEST = 1000  # steps of a rollout
 LOOKS = 64  # steps of it whose frames are compared
-ROLLOUTS, FEWEST = 12, 2  # in all: where frames need not be drawn at every step, and where they must
-BATCH, SHOWN = 6, 3  # rollouts at a time, and observed frames before them
+ROLLOUTS, SHOWN = 4, 3  # and observed frames before each
 PAIRS = 512  # of random pictures
-FIT_STEPS = 600
+FIT_STEPS, ALIKE = 300, 0.01  # and the weight with which rates are drawn to each other
 
 
 class DriftFrames(NamedTuple):
     """N frames of rollouts: the way since evidence gone [N, len(GONE)], the error that is expected at the true place [N], the error
-    [N], the step of the rollout [N] and the number of the rollout [N]."""
+    [N] and the step of the rollout [N]."""
 
     gone: torch.Tensor
     expected: torch.Tensor
     error: torch.Tensor
     step: torch.Tensor
-    rollout: torch.Tensor
 
 
 def ceiling_of(recording: Recording, seed: int) -> float:
@@ -49,22 +46,11 @@ def ceiling_of(recording: Recording, seed: int) -> float:
 
 
 def drift_horizon(recording: Recording, frames: int) -> int:
-    """Steps of the rollouts, for so many frames of the uncertainty's training: the longest that two tenths of its rows in a row
+    """Steps of the rollouts, for the number of frames that an uncertainty is learned from: the longest that a fifth of the rows
     allow."""
     ahead = steps_ahead(recording)
     typical = int(np.quantile(ahead[ahead > 0], 0.8)) if (ahead > 0).any() else 0
     return min(LONGEST, max(8, frames // 4), max(0, typical - SHOWN))
-
-
-def drift_cost(world: LearnedWorld, recording: Recording, frames: int) -> int:
-    """How many frames `drift_frames` draws."""
-    horizon = drift_horizon(recording, frames)
-    return ROLLOUTS * min(LOOKS, horizon) if leaps(world) else FEWEST * horizon
-
-
-def leaps(world: LearnedWorld) -> bool:
-    """Whether a frame can be drawn at a pose alone, without those before it."""
-    return world.config.geometry and not world.config.moving
 
 
 @torch.inference_mode()
@@ -72,63 +58,56 @@ def drift_frames(
     world: LearnedWorld,
     recording: Recording,
     horizon: int,
-    *,
-    rollouts: int | None = None,
+    rollouts: int = ROLLOUTS,
     seed: int = 0,
     limit_s: float = 1e9,
 ) -> DriftFrames:
-    """Frames of rollouts of `world`, which has an uncertainty, along recorded episodes; determined by the seed unless the time
-    is over. rollouts: None for as many as the kind of world needs."""
-    network, leaping, began = world.uncertainty, leaps(world), time.monotonic()
+    """Frames of rollouts of `world`, which has an uncertainty, along recorded episodes; determined by the seed, and by `limit_s`
+    seconds after which they end."""
+    network, began = world.uncertainty, time.monotonic()
     assert isinstance(network, UncertaintyNetwork)
-    seen: list[tuple[Conditioning, torch.Tensor]] = []
-    dreamer = world.replaced(
-        uncertainty=UncertaintyProbe(lambda conditioning, clean, _: seen.append((conditioning, clean)))
-    )
-    rng, parts = np.random.default_rng([seed, 14]), []
-    rows_ahead = np.flatnonzero(steps_ahead(recording) >= SHOWN + horizon)
-    whole = rollouts or (ROLLOUTS if leaping else FEWEST)
-    looks = set(np.geomspace(1, horizon, LOOKS // 2).astype(int)) | set(np.linspace(1, horizon, LOOKS // 2).astype(int))
-    for number, some in enumerate(np.split(rng.choice(rows_ahead, whole), range(BATCH, whole, BATCH))):
-        chance = make_rng(int(rng.integers(2**62)))
-        state = first = observed(dreamer, recording, some, SHOWN, chance)
-        for step in range(1, horizon + 1):
-            rows = some + SHOWN - 1 + step
-            state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)
-            if step in looks:
-                frame = _look(dreamer, state, first if leaping else None, chance)
-                conditioning, clean = seen[-1]
-                situation = situation_of(placed(state["gone"]), conditioning)
-                expected = network.calibrated(network(input_maps(conditioning, clean), situation).mean((1, 2)))
-                error = (frame - recording.rgb(rows).float()).abs().mean((1, 2, 3)) / 255
-                which = torch.arange(len(some)) + number * BATCH
-                parts.append(DriftFrames(state["gone"], expected, error, torch.full_like(which, step), which))
-                seen.clear()
-            if time.monotonic() - began > limit_s:
-                break
+    seen: list[torch.Tensor] = []
+
+    def note(conditioning: Conditioning, clean: torch.Tensor, gone: torch.Tensor) -> None:
+        answer = network(input_maps(conditioning, clean), situation_of(placed(gone), conditioning))
+        seen.append(network.calibrated(answer.mean((1, 2))))
+
+    dreamer = world.replaced(uncertainty=UncertaintyProbe(note))
+    rng, parts, half = np.random.default_rng([seed, 14]), [], LOOKS // 2
+    looks = {*np.geomspace(1, horizon, half).astype(int), *np.linspace(1, horizon, half).astype(int)}
+    begins = rng.choice(np.flatnonzero(steps_ahead(recording) >= SHOWN + horizon), rollouts)
+    chance = make_rng(int(rng.integers(2**62)))
+    state = observed(dreamer, recording, begins, SHOWN, chance)
+    for step in range(1, horizon + 1):
+        rows = begins + SHOWN - 1 + step
+        state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)
+        drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
+        if step in looks:
+            error = (drawn - recording.rgb(rows).float()).abs().mean((1, 2, 3)) / 255
+            parts.append(DriftFrames(state["gone"], seen[-1], error, torch.full_like(state["gone"][:, 0], step)))
+        seen.clear()
+        if time.monotonic() - began > limit_s:
+            break
     return DriftFrames(*map(torch.cat, zip(*parts)))
 
 
-def _look(world: LearnedWorld, state: State, first: State | None, chance: torch.Generator) -> torch.Tensor:
-    """The frame of a state, float [B, 3, H, W] in 0..255; drawn at its pose from what `first` knows, if that is given."""
-    shown = state if first is None else world.observe({"pose": state["pose"]}, first, chance)
-    return world.render(shown, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
-
-
 def fit_drift(network: UncertaintyNetwork, frames: DriftFrames) -> None:
-    """Sets the network's rates of drift: those under which the errors are likeliest, each exponential about its expectation."""
-    rates = torch.tensor([-7.0, -3.0, -3.0, 0.0], requires_grad=True)  # logarithms
+    """Sets the network's rates of drift: those under which the errors are likeliest, each exponential about its expectation. Steps,
+    metres and radians go together in rollouts: what the errors do not tell apart counts alike."""
+    gone, base, error = frames.gone[:, :3].clone(), frames.expected.clone(), frames.error.clone()
+    usual = gone.mean(0)
+    gone, room = gone / usual.clamp_min(1e-6), (network.ceiling.clone() - base).clamp_min(0)
+    rates = torch.zeros(4, requires_grad=True)  # logarithms, the last of the power
     learner = torch.optim.Adam([rates], 0.05)
-    gone, base, error = (part.clone() for part in (frames.gone, frames.expected, frames.error))
-    room = (network.ceiling.clone() - base).clamp_min(0)
     for _ in range(FIT_STEPS):
-        hazard = (gone[:, :3] @ rates[:3].exp()).clamp_min(1e-9) ** rates[3].exp()
+        hazard = (gone @ rates[:3].exp()).clamp_min(1e-9) ** rates[3].exp()
         expected = (base + room * (1 - torch.exp(-hazard))).clamp_min(1e-4)
-        loss = (expected.log() + error / expected).mean()
+        loss = (expected.log() + error / expected).mean() + ALIKE * rates[:3][usual > 0].var(correction=0)
         learner.zero_grad()
         loss.backward()
         learner.step()
-    network.drift.copy_(rates.detach().exp())
+    fitted = rates.detach().exp()
+    network.drift.copy_(torch.cat([torch.where(usual > 0, fitted[:3] / usual.clamp_min(1e-6), 0.0), fitted[3:]]))
 
 
 def reliability(expected: torch.Tensor, error: torch.Tensor, groups: int = 10) -> list[float]:

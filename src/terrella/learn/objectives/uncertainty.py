@@ -37,7 +37,7 @@ from ..feeds import RandomBatches
 from ..recording import Recording
 from ..run_folder import resume_file
 from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
-from .drift import ceiling_of, drift_cost, drift_frames, drift_horizon, fit_drift
+from .drift import ROLLOUTS, ceiling_of, drift_frames, drift_horizon, fit_drift
 from .stress import steps_ahead
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
@@ -136,7 +136,10 @@ def uncertainty_seconds(world: LearnedWorld, recording: Recording, frames: int) 
         now = TrainStep(step, 0.0, CPU, np.random.default_rng(step), make_rng(step))
         for loss in objective.losses(objective.sample(now), now):
             loss.value.backward()
-    return dreamt_s * (frames + drift_cost(world, recording, frames)) + (time.monotonic() - began) * _steps(frames) / 3
+    return (
+        dreamt_s * (frames + ROLLOUTS * drift_horizon(recording, frames))
+        + (time.monotonic() - began) * _steps(frames) / 3
+    )
 
 
 def dreaming_seconds(world: LearnedWorld, recording: Recording, frames: int) -> float:

@@ -136,7 +136,7 @@ function paint(time) {
   if (live && !fresh && worlds[0].events.some((name) => frame.vitals[worlds[0].vitals.indexOf(name)] > now.vitals[worlds[0].vitals.indexOf(name)])) screens.strike();
   Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
-  uncertainty.show(frame.uncertainty, !!(frame.flags & FRESH) || !live);
+  uncertainty.show(frame.uncertainty, frame.drifted, !!(frame.flags & FRESH) || !live);
   seen.painted += 1;
   keep(seen.times, time);
   keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });

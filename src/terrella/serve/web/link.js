@@ -1,6 +1,6 @@
 // The connection: one WebSocket, frames decoded off the main thread, acknowledged, and reconnection.
 
-const VERSION = 3, HEADER = 52;
+const VERSION = 4, HEADER = 56;
 export const DONE = 1, FRESH = 2, REPLAY = 4;
 
 /** A frame message (see serve/protocol.py) as its numbers and its JPEG bytes. */
@@ -10,7 +10,8 @@ export function readFrame(buffer) {
   const frame = {
     flags: view.getUint8(1), seq: view.getUint32(4, true), step: view.getUint32(8, true), oldest: view.getUint32(12, true),
     newest: view.getUint32(16, true), actionId: view.getUint32(20, true), generationMs: view.getFloat32(24, true),
-    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), uncertainty: view.getFloat32(48, true), images: [],
+    score: view.getFloat32(28, true), clientMs: view.getFloat64(32, true), uncertainty: view.getFloat32(48, true),
+    drifted: view.getFloat32(52, true), images: [],
   };
   let at = HEADER;
   for (let left = view.getUint16(2, true); left > 0; left--) {

@@ -1,34 +1,40 @@
-// The thin bar under the picture that shows its expected error.
+// The thin bar under the picture that shows how much of it is invented, and the words "invented" and "position drifted".
 
-const WORDS = { low: 'Low uncertainty', medium: 'Raised uncertainty', high: 'High uncertainty' };
+const WORDS = { low: 'Little is invented', medium: 'Parts are invented', high: 'Most is invented' };
 
 export class Uncertainty {
   constructor(root, fill) {
-    Object.assign(this, { root, fill, value: -1, level: '', shown: '' });
+    Object.assign(this, { root, fill, value: -1, level: '', drifted: 0, shown: '' });
     this.limits = null;
   }
 
-  /** [the error that is usual for this world, the error from which it invents]; null where it does not say. */
-  set levels(pair) {
-    this.limits = pair;
+  /** [the error that is usual for this world, that from which it invents, that by drift from which the position is lost]; null
+   *  where it does not say. */
+  set levels(limits) {
+    this.limits = limits;
     this.value = -1;
-    this.root.hidden = !pair;
+    this.root.hidden = !limits;
   }
 
-  /** The error to expect of the frame just painted (mean, of intensities 0 to 1). `now`: without easing. */
-  show(error, now) {
+  /** The error to expect of the frame just painted (mean, of intensities 0 to 1), and the part of it by a position that has drifted;
+   *  the rest is invention. `now`: without easing. */
+  show(error, drifted, now) {
     if (!this.limits || error < 0) return;
-    const [usual, high] = this.limits;
-    this.value = now || this.value < 0 ? error : this.value + 0.15 * (error - this.value);
+    const [usual, high, lost] = this.limits, first = now || this.value < 0, ease = (from, to) => first ? to : from + 0.15 * (to - from);
+    this.value = ease(this.value, error - drifted);
+    this.drifted = ease(this.drifted, drifted);
     const bound = this.level === 'high' ? 0.85 : 1;  // a level is left later than it is entered: no flicker
     this.level = this.value >= bound * high ? 'high' : this.value >= usual + bound * 0.4 * (high - usual) ? 'medium' : 'low';
-    const share = Math.min(1, this.value / (1.6 * high)).toFixed(3);
-    if (share === this.shown) return;
-    this.shown = share;
+    const away = this.drifted >= lost * (this.root.dataset.drifted === 'true' ? 0.85 : 1);
+    const share = Math.min(1, this.value / (1.6 * high)).toFixed(3), percent = (part) => `${(100 * part).toFixed(1)}%`;
+    if (`${share} ${percent(this.drifted)}` === this.shown) return;
+    this.shown = `${share} ${percent(this.drifted)}`;
     this.fill.style.transform = `scaleX(${share})`;
     this.root.dataset.level = this.level;
+    this.root.dataset.drifted = away;
     this.root.ariaValueMax = 1.6 * high;
     this.root.ariaValueNow = this.value;
-    this.root.title = `${WORDS[this.level]}: expected error of the picture: ${(100 * this.value).toFixed(1)}% of full brightness`;
+    this.root.title = `${WORDS[this.level]}. Expected error of the picture: ${percent(this.value)} of full brightness by invention, `
+      + `${percent(this.drifted)} by a position that has drifted`;
   }
 }
