@@ -18,7 +18,7 @@ from terrella.worlds.controls import Controls
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.uncertainty import GONE, UncertaintyConfig, UncertaintyNetwork
 
-BUNDLED = ("doom-maze",)
+BUNDLED = ("doom-maze", "doom-corridor", "islet")
 
 
 def made_up(rate: float, power: float, ceiling: float, seed: int) -> DriftFrames:
@@ -47,6 +47,7 @@ def test_the_error_is_expected_in_every_tenth_of_other_rollouts(rate, power, cei
     assert max(map(abs, (1 - ratio for ratio in reliability(expected, doubled)))) > 0.4, "it would be noticed"
 
 
+@pytest.mark.slow
 def test_a_walk_of_1000_steps_drifts_up_to_the_ceiling_and_invents_no_more_than_before():
     torch.manual_seed(0)
     network = UncertaintyNetwork(UncertaintyConfig())
@@ -97,7 +98,7 @@ def test_a_bundled_world_knows_its_ceiling_and_how_it_drifts(name):
     network = terrella.load(name).uncertainty
     far = torch.tensor([[1.0, 0, 0, 0, 0], [1000.0, 70, 20, 0, 0]])
     near, away = network.drifts(far).tolist()
-    assert 0.05 < float(network.ceiling) < 0.3 and near < 0.3 and 0.4 < away <= 1
+    assert 0.03 < float(network.ceiling) < 0.3 and near < 0.5 < away <= 1
     assert float(network.sure) < float(network.invents) < float(network.ceiling)
 
 
