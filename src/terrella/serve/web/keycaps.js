@@ -47,7 +47,9 @@ export function hintsOf(world) {
   const moves = groups.map((codes) => codes.sort((a, b) => place(a) - place(b)).filter((code) => !done.has(world.keys[code]) && done.add(world.keys[code])));
   const spoken = deeds.sort((a, b) => (b === 'Space') - (a === 'Space')).slice(0, 3).map((code) => [[code], keyMeaning(world, code)]);
   const either = groups[1].length && !moves[1].length ? ' (or arrow keys)' : '';
-  return [...spoken, ...moves.filter((codes) => codes.length).map((codes) => [codes, together(codes.map((code) => keyMeaning(world, code))) + either])];
+  const words = moves.filter((codes) => codes.length).map((codes) => [codes, together(codes.map((code) => keyMeaning(world, code))) + either]);
+  const way = ([, word]) => MOVES.has(word.toLowerCase());  // up and down are moves, not deeds
+  return [...spoken.filter((one) => !way(one)), ...words, ...spoken.filter(way)];
 }
 
 /** Fills `root` with caps, as many as there is room for; a click on one calls `chosen(code)`, on the last, which is for all others, `chosen()`. Gives a function that lights up the held ones. */
