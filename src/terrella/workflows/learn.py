@@ -172,7 +172,12 @@ class _Learning:
     def _foresee(self, world: World) -> None:
         """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
         schedule = self.schedule
-        pace = time_environment(world, self.config.seed)
+        posed = (
+            "pose" in world.spec.channels
+        )  # preparing such a world, with memory and motion, takes longer than a trial may
+        if not posed:
+            self.progress("A trial of some seconds: what does this machine manage?")
+        pace = None if posed else time_environment(world, self.config.seed)
         if pace is None:
             return
         recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
@@ -188,7 +193,6 @@ class _Learning:
         most = SMALL if schedule.seconds < 60 * SHORT_MIN else MOST
         world = self.config.controls.of(open_small(opened, environment, most))
         if not schedule.has_recording:
-            self.progress("A trial of some seconds: what does this machine manage?")
             self._foresee(world)
             schedule.facts["trial_s"] = schedule.elapsed_s
         self._announce()  # after it was opened: nothing is announced of an environment that does not open
