@@ -139,7 +139,7 @@ def test_each_environment_starts_by_its_own_seed(forkable):
     )
 
 
-@pytest.mark.parametrize("seed", [[1], [1, 2, 3], [1, -2], -1, [0, 2**64]])
+@pytest.mark.parametrize("seed", [[1], [1, 2, 3], [1, -2], -1, [0, 2**64], [1.5, 2], "one"])
 def test_seeds_that_are_not_one_for_each_environment_are_refused(cartpole, seed):
     with pytest.raises(TerrellaError, match="a list of one for each of 2 environments"):
         as_env(cartpole, num_envs=2).reset(seed=seed)

@@ -88,9 +88,9 @@ def model(timestep: float) -> SimpleNamespace:
         (Env(25, sim=SimpleNamespace(dt=0.04)), 0.04, "its sim.dt"),
         (Env("12.5 Hz"), 0.08, "its render_fps"),
         (Env(np.array([15])), 1 / 15, "its render_fps"),
-        (Env("fast"), None, "none; its render_fps, 'fast', is no rate"),
-        (Env(0), None, "none; its render_fps, 0, is no rate"),
-        (Env(), None, "none"),
+        (Env("fast"), None, "no rate is declared; its render_fps, 'fast', is no rate"),
+        (Env(0), None, "no rate is declared; its render_fps, 0, is no rate"),
+        (Env(), None, "no rate is declared"),
         (
             Env(50, "data.time", 0.01, data=SimpleNamespace(time=0.0)),
             0.01,
@@ -98,6 +98,7 @@ def model(timestep: float) -> SimpleNamespace:
         ),
         (Env(15, "time", 0.5, time=0.0), 0.5, "its clock `time`; by its render_fps it would be 15"),
         (Env(15, "time", 1, time=0), 1 / 15, "its render_fps"),  # a count of steps
+        (Env(15, "time", 1.0, time=0.0), 1 / 15, "its render_fps"),
         (
             Env(15, "data.time", 0.0, data=SimpleNamespace(time=0.0)),
             1 / 15,
@@ -130,7 +131,7 @@ def test_an_environment_without_metadata_or_with_a_step_that_fails_has_a_length(
     env = Env(None, "time", 0.1, time=0.0)
     env.metadata = None
     env.step = lambda action: 1 / 0
-    assert step_length(env) == (None, "none")
+    assert step_length(env) == (None, "no rate is declared")
 
 
 @pytest.mark.parametrize("value", [2, 2.0, np.float32(2), np.array(2), np.array([2.0]), np.array([[2]]), [2], (2.0,)])

@@ -25,6 +25,10 @@ BOUNDS = {
     "diffusion policy": {"meta/episode_ends": np.array([5, 9, 12])},
     "lengths": {"episode_lengths": np.array(LENGTHS)},
     "numbers": {"episode_index": np.repeat([7, 3, 9], LENGTHS)},
+    "IQL": {"dones_float": LAST.astype(np.float32), "masks": np.ones(ROWS)},
+    "RLlib": {"terminateds": np.arange(ROWS) == 4, "truncateds": np.arange(ROWS) == 8},
+    "first rows": {"path_starts": np.array([0, 5, 9])},
+    "first rows and lengths": {"ep_offset": np.array([0, 5, 9]), "ep_len": np.array(LENGTHS)},
 }
 
 
@@ -118,11 +122,32 @@ def test_what_has_no_row_for_each_step_of_one_episode_is_named(tmp_path):
         file["nothing"] = h5py.Empty("f")
     source = open_source(tmp_path / "a.hdf5", fps=10)
     assert set(source.sensors) == {"action", "observation.images.top", "next.done"} and len(list(source.takes())) == 1
-    assert [sum(name in note for note in source.notes) for name in ("goal", "matrix", "nothing")] == [1, 1, 1]
+    assert [sum(f"'{name}'" in note for note in source.notes) for name in ("goal", "matrix", "nothing")] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".hdf5"])
+def test_where_nothing_marks_an_end_it_is_said(tmp_path, suffix):
+    for flags in ({}, {"terminals": np.zeros(ROWS, bool)}):
+        saved(tmp_path / f"a{suffix}", {"observations": STATE, "actions": ACTION, **flags})
+        source = open_source(tmp_path / f"a{suffix}")
+        assert sum("nothing marks the end of an episode: the 12 rows" in note for note in source.notes) == 1
+    saved(tmp_path / f"a{suffix}", {"observations": STATE, "actions": ACTION, "terminals": np.arange(ROWS) == ROWS - 1})
+    assert not any("marks" in note for note in open_source(tmp_path / f"a{suffix}").notes)
+
+
+def test_episodes_beside_each_other_are_refused(tmp_path):
+    flags, more = LAST.reshape(3, 4), {"observations": STATE.reshape(3, 4, 2), "actions": ACTION.reshape(3, 4, 1)}
+    saved(tmp_path / "a.npz", {**more, "terminals": flags})
+    with pytest.raises(DatasetError, match=r"'terminals'.*\[3, 4\].*one after another"):
+        open_source(tmp_path / "a.npz")
 
 
 def test_bounds_that_do_not_fit_are_refused(tmp_path):
-    for bounds in ({"episode_ends": np.array([5, 99])}, {"episode_ends": np.array([5, 5])}):
+    for bounds in (
+        {"path_starts": np.array([0, 99])},
+        {"episode_ends": np.array([5, 99])},
+        {"episode_ends": np.array([5, 5])},
+    ):
         saved(tmp_path / "a.npz", {"observations": STATE, "actions": ACTION, **bounds})
-        with pytest.raises(DatasetError, match="episode_ends.*does not fit its 12 rows"):
+        with pytest.raises(DatasetError, match="does not fit its 12 rows"):
             open_source(tmp_path / "a.npz")

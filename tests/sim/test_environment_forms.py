@@ -83,6 +83,7 @@ def drawn(picture) -> np.ndarray:
         RGB.astype(np.int32) * 256,
         RGB.astype(np.int64),
         RGB.astype(np.float64),
+        RGB / 127.5 - 1,
         RGB[None],
         RGB.tolist(),
         [np.zeros_like(RGB), RGB],
@@ -110,7 +111,8 @@ def test_a_grey_picture_in_any_form_is_grey(picture):
 
 
 def test_a_bilevel_picture_is_black_and_white_and_a_dark_one_stays_dark():
-    assert set(np.unique(drawn(GREY[:, :] > np.arange(32) * 10))) == {0, 255}
+    bilevel = GREY[:, :] > np.arange(32) * 10
+    assert set(np.unique(drawn(bilevel))) == set(np.unique(drawn(bilevel.astype(np.int64)))) == {0, 255}
 
     class Dawn(Plain):
         def render(self):
@@ -282,6 +284,15 @@ def test_a_text_that_changes_within_an_episode_is_the_instruction_of_the_rows_th
     record(world, Random(world.spec), tmp_path / "r", 4, make_rng(0))
     (take,) = Dataset(tmp_path / "r").source().takes()
     assert [text for _, text in take.facts["language"]] == ["left", "right"]
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint16, np.float64])
+def test_an_observation_of_numbers_up_to_255_is_a_picture(dtype):
+    space = spaces.Box(0, 255, RGB.shape, dtype)
+    world = GymnasiumWorld(
+        type("Plain", (Plain,), {"observation_space": space, "seen": lambda self: RGB.astype(dtype)})
+    )
+    assert np.array_equal(world.render(world.start(1, make_rng(0)), ("rgb",))["rgb"][0].numpy(), RGB)
 
 
 def test_further_pictures_of_an_observation_are_cameras(tmp_path):

@@ -103,6 +103,7 @@ SERVOS = {  # actuator: joints' limits, low, high, and why
     '<velocity joint="swing" kv="2" forcerange="-90 90"/>': ("", "", -45, 45, "its force range over its gain"),
     '<velocity joint="slide" kv="2"/>': ("", 'range="-.2 .5"', -0.7, 0.7, "its range in a second"),
     '<intvelocity joint="swing" kp="9" actrange="-1 1"/>': ("", "", -10 * np.pi, 10 * np.pi, "nothing limits it"),
+    '<general joint="swing" gaintype="affine" gainprm="0 0 -2"/>': ("", "", -1, 1, "its gear"),
     '<muscle joint="swing" lengthrange="-1 1"/>': ("", "", 0, 1, "a muscle's excitation"),
 }  # fmt: skip
 
@@ -117,6 +118,7 @@ def test_controls_without_limits_get_those_of_what_they_move(tmp_path, servo):
         why = "its range"
     assert (box.low.tolist(), box.high.tolist()) == (pytest.approx([low], rel=1e-5), pytest.approx([high], rel=1e-5))
     assert f"({why}" in world.spec.card["notes"][0]
+    assert "0 N m" not in world.spec.action_units
 
 
 HOME = '<keyframe><key name="home" qpos="{}"{}/></keyframe>'

@@ -286,6 +286,14 @@ def test_specular_glossiness_has_its_own_base_colour(tmp_path):
     assert [colour_at(scene, u, v) for u, v in QUARTERS[:2]] == [[1, 0, 0], [0, 1, 0]]
 
 
+def test_a_grey_picture_of_16_bits_keeps_its_brightness(tmp_path):
+    file = File()
+    about = {"images": [{"bufferView": file.picture(np.full((8, 8), 40000, np.uint16))}], "textures": [{"source": 0}]}
+    about |= {"materials": [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}]}
+    picture = file.read(tmp_path, file.floor(attributes={"TEXCOORD_0": file.add(UV)}), **about).materials[0].picture
+    assert picture is not None and np.unique(picture.pixels).tolist() == [155, 255]  # and opaque
+
+
 def test_only_what_shines_in_the_picture_of_its_glow_glows(tmp_path):
     """A panel that is half dark: an emissive picture multiplies the emissive factor."""
     half = {

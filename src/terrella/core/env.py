@@ -112,8 +112,9 @@ class WorldEnv(VectorEnv):
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + place for place in range(self.num_envs)]
         else:
-            seeds = [None if one is None else int(one) for one in np.atleast_1d(np.asarray(seed, object)).tolist()]
-        if len(seeds) != self.num_envs or any(one is not None and not 0 <= one < 2**63 for one in seeds):
+            seeds = np.atleast_1d(np.asarray(seed, object)).tolist()
+        whole = all(one is None or (isinstance(one, int | np.integer) and 0 <= one < 2**63) for one in seeds)
+        if len(seeds) != self.num_envs or not whole:
             raise TerrellaError(
                 f"seed is a number from 0 on, or a list of one for each of {self.num_envs} environments; got {seed}."
             )

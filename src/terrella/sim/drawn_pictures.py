@@ -17,13 +17,14 @@ class DrawnPictures:
     """Reads what `render()` returns. The range of its numbers is that of the brightest picture so far.
 
     An array, tensor, PIL image or nested list of [H, W], [H, W, C] or [C, H, W], where C is 1 (grey), 2 (grey and alpha), 3 or 4
-    (alpha, or depth, which is left out). Integers are up to 255, or to 65535 where one is above 255; floats up to 1, or to 255
-    where one is far above 1. Of a list of pictures the last counts, of a tuple and of a mapping the first with colours. `form`
-    describes the first picture where it is none of uint8 [H, W, 3]. TerrellaError for anything else.
+    (alpha, or depth, which is left out). White is 1; or 255 where a number is above 1 (of floats: far above); or 65535 where one
+    is above 255. Black is 0, or -1 where floats up to 1 go below -0.5. Of a list of pictures the last counts, of a tuple and of a
+    mapping the first with colours. `form` describes the first picture where it is none of uint8 [H, W, 3]. TerrellaError for
+    anything else.
     """
 
     def __init__(self):
-        self.form, self._white = "", 0.0
+        self.form, self._white, self._signed = "", 0.0, False
 
     def read(self, value: Any) -> np.ndarray:
         """The picture as uint8 [H, W, 3]."""
@@ -37,6 +38,8 @@ class DrawnPictures:
             array = (np.clip(array, 0, 65535) // 256).astype(np.uint8)  # the high byte, as 16-bit pictures are read
         elif array.dtype != np.uint8:
             bright = np.nan_to_num(np.asarray(array, np.float64)) / self._white
+            self._signed = self._signed or (self._white == 1 and bright.min() <= -0.5)
+            bright = (bright + 1) / 2 if self._signed else bright
             array = (np.clip(bright, 0, 1) * 255).round().astype(np.uint8)
         self.form = self.form or f"drawn as {what} up to {self._white:g}"
         return array if array.shape[2] == 3 else array.repeat(3, 2)
@@ -97,6 +100,6 @@ def _white(array: np.ndarray) -> float:
     if array.dtype == bool:
         return 1.0
     top = float(np.nan_to_num(array, posinf=0.0).max())
-    if array.dtype.kind == "f" and top <= MOST_OVERSHOOT:
+    if top <= (MOST_OVERSHOOT if array.dtype.kind == "f" else 1):
         return 1.0
     return 255.0 if not top > 255 else 65535.0

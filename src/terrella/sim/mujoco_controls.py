@@ -87,7 +87,7 @@ def control_unit(model: mujoco.MjModel, at: int) -> str:
         return ""
     gear = abs(float(model.actuator_gear[at, 0] * model.actuator_gainprm[at, 0]))
     force = "N" if slides else "N m"
-    return force if gear == 1 else f"{gear:g} {force}"
+    return "" if not gear else force if gear == 1 else f"{gear:g} {force}"
 
 
 def control_mode(model: mujoco.MjModel) -> str:

@@ -169,15 +169,15 @@ def check_space(space: spaces.Space, name: str, what: str) -> None:
 
 
 def picture_form(space: spaces.Space) -> str:
-    """The layout of a space of pictures (uint8, or floats from 0 to 1 or to 255): "hwc", "chw", "hw"; else ""."""
+    """The layout of a space of pictures (numbers from 0 to 255, or floats from 0 to 1): "hwc", "chw", "hw"; else ""."""
     shape = space.shape or ()
     if not isinstance(space, spaces.Box):
         return ""
     if space.dtype == np.uint8 and len(shape) == 3 and shape[2] == 3:
         return "hwc"
-    whites = (
-        space.dtype.kind == "f" and (space.low >= 0).all() and ((space.high == 1).all() or (space.high == 255).all())
-    )
+    floats, integers = space.dtype.kind == "f", space.dtype.kind in "iu"
+    whites = (space.low >= 0).all() and ((floats and (space.high == 1).all()) or (space.high == 255).all())
+    whites = whites and (floats or integers)
     if not (space.dtype == np.uint8 or whites) or len(shape) not in (2, 3):
         return ""
     for form, size, depth in (("hwc", shape[:2], shape[2:]), ("chw", shape[1:], shape[:1]), ("hw", shape, (1,))):

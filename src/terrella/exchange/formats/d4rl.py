@@ -40,7 +40,7 @@ def read(path: Path, fps: float | None) -> Source:
                 readings = arrays.readings(seen, sensors, np.arange(count) / rate, str(path))
                 yield Take(readings, task, facts={"rows": list(span), **({"texts": texts} if texts else {})})
 
-    notes += [*more, *([flat.BARE] if bare else [])]
+    notes += [*more, *episodes.notes, *([flat.BARE] if bare else [])]
     return arrays.source("D4RL's layout", path.stem, sensors, takes, fps=fps, notes=notes, facts={"d4rl": facts})
 
 

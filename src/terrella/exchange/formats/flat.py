@@ -20,18 +20,26 @@ SPELLINGS = {  # `rollouts.write` uses the first
     rows.OBSERVATION: ("observations", "observation", "obs"),
     rows.ACTION: ("actions", "action", "acts"),
     rows.REWARD: ("rewards", "reward", "rews"),
-    rows.DONE: ("terminations", "terminated", "terminals", "terminal", "dones", "done", "is_terminal"),
-    rows.TRUNCATED: ("truncations", "truncated", "timeouts"),
+    rows.DONE: (
+        "terminations", "terminated", "terminateds", "terminals", "terminal", "terminal_flags", "dones", "done",
+        "dones_float", "done_bool", "done_flags", "is_terminal", "is_done",
+    ),
+    rows.TRUNCATED: ("truncations", "truncated", "truncateds", "timeouts", "timeout", "is_truncated"),
     rows.INFO: ("infos", "info"),
-}
+}  # fmt: skip
 NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in spellings}
 NEXT = ("next_observations", "next_observation", "next_obs")
 _LAST, _FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
 _STEP_TYPE, _LAST_STEP = "step_type", 2  # of dm_env
 # of each episode the row after its last one; its last one, where the very last row is named
-_ENDS = ("episode_ends", "traj_ends")
-_LENGTHS = ("episode_lengths", "traj_lengths")
-_NUMBERS = ("episode_index", "episode_id", "episode_ids", "traj_id", "traj_ids")  # of the episode of each row
+_ENDS = ("episode_ends", "traj_ends", "trajectory_ends", "ep_ends")
+_LENGTHS = ("episode_lengths", "traj_lengths", "trajectory_lengths", "path_lengths", "ep_lengths", "ep_len")
+# of each episode its first row; "episode_starts" may also be a flag for each step
+_STARTS = ("episode_starts", "traj_starts", "trajectory_starts", "path_starts", "ep_offset", "episode_offsets")
+_NUMBERS = (  # of the episode of each row
+    "episode_index", "episode_id", "episode_ids", "episode", "episode_num", "ep_idx", "traj_id", "traj_ids",
+    "trajectory_id", "trajectory_ids", "demo_id",
+)  # fmt: skip
 _FOLDERS = ("data", "meta")  # of diffusion policy's files
 BARE = "no array has a name of observations: all that have a row for each step are taken for them."
 
@@ -44,6 +52,7 @@ class Episodes:
     more:   place -> its rows beside those of the steps: 0, 1 at the very end, or 1 after each episode.
     after:  place of an observation -> its array of next observations.
     texts:  place -> texts with a row for each step, or one instruction for all.
+    notes:  what to say where nothing marks an end.
     """
 
     stored: Mapping[Place, Array]
@@ -51,6 +60,7 @@ class Episodes:
     more: Mapping[Place, int]
     after: Mapping[Place, Array]
     texts: Mapping[Place, Array]
+    notes: tuple[str, ...]
 
     def cut(self, number: int) -> dict[Place, Array]:
         """The arrays of one episode."""
@@ -109,7 +119,7 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
     texts: dict[Place, Array] = {}
     for place, array in stored.items():
         role, rest = NAMES.get(str(place[0])), place[1:]
-        if place[0] in (*_ENDS, *_LENGTHS):
+        if place[0] in (*_ENDS, *_LENGTHS) or _are_starts(place, array, count):
             continue
         kept[place], more[place] = array, (array.shape[0] if array.shape else 0) - count
         if array.dtype.kind in "USO" and len(array.shape) < 2:
@@ -135,7 +145,8 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
             del kept[place]
         else:
             kept[place] = Array((), kept[place].dtype)
-    return Episodes(kept, spans, more, after, texts)
+    open_ = f"nothing marks the end of an episode: the {count} rows of {where} are one."
+    return Episodes(kept, spans, more, after, texts, () if whole or ends.any() else (open_,))
 
 
 def _steps(stored: Mapping[Place, Array]) -> int:
@@ -149,6 +160,12 @@ def _steps(stored: Mapping[Place, Array]) -> int:
     return max(arrayed.values(), default=0)
 
 
+def _are_starts(place: Place, array: Array, count: int) -> bool:
+    """Whether an array numbers the first rows of episodes."""
+    rowwise = array.shape[:1] == (count,) and place[0] in _FIRST
+    return place[0] in _STARTS and array.dtype.kind in "iu" and len(array.shape) == 1 and not rowwise
+
+
 def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
     """bool [count]: the last step of each episode."""
     ends, flags = np.zeros(count, bool), np.zeros(count, bool)
@@ -156,9 +173,16 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
         if rest or not array.is_numeric:
             continue
         rowwise = math.prod(array.shape) == array.shape[0] == count
-        if head in (*_ENDS, *_LENGTHS):
+        starts, flag = _are_starts((head,), array, count), NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)
+        if flag and math.prod(array.shape[1:]) > 1:
+            has = f"{list(array.shape)} numbers, and one for each step is needed"
+            raise DatasetError(
+                f"'{head}' in {where} has {has}: store the episodes one after another, or a file for each."
+            )
+        if starts or head in (*_ENDS, *_LENGTHS):
             values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
             stops = np.cumsum(values) if head in _LENGTHS else values + (values.max(initial=0) == count - 1)
+            stops = np.append(values[1:], count) if starts else stops
             if (np.diff(stops, prepend=0) < 1).any() or stops.max(initial=0) > count:
                 raise DatasetError(f"'{head}' in {where} does not fit its {count} rows; mend it, or drop it.")
             ends[stops - 1] = True
@@ -168,7 +192,7 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             ends[:-1] |= array.read(0, count).reshape(-1)[1:].astype(bool)
         elif rowwise and head == _STEP_TYPE:
             flags |= array.read(0, count).reshape(-1) == _LAST_STEP
-        elif rowwise and (head in _LAST or NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)):
+        elif rowwise and (flag or head in _LAST):
             flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
     if count > 1 and flags[-2:].all() and not flags[-3:-2].any():
         flags[-2] = False  # flagged at the last step and at the terminal observation

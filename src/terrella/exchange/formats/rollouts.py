@@ -41,16 +41,16 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
     own = {_place(key): described[name] for name, key in _keys(described).items()}
-    every = [flat.split(_columns(file), str(file), bool(about)).stored for file in files]
-    stored = arrays.union(every)
+    every = [flat.split(_columns(file), str(file), bool(about)) for file in files]
+    stored = arrays.union(episodes.stored for episodes in every)
     bare = flat.is_bare(stored)
     sensors, notes = arrays.columns(stored, partial(flat.guess, bare), "the key", own)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
-        keys = ", ".join(map(arrays.spelled, every[0])) or "nothing"
+        keys = ", ".join(map(arrays.spelled, every[0].stored)) or "nothing"
         raise DatasetError(
             f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME. {' '.join(notes)}"
         )
-    notes += [flat.BARE] * bare
+    notes += [*([flat.BARE] * bare), *(every[0].notes if len(files) == 1 else ())]
 
     def takes(rate: float) -> Iterator[Take]:
         for file in files:

@@ -111,7 +111,8 @@ class Gltf:
             with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as opened:
                 if opened.width * opened.height > MOST_PIXELS:
                     raise ValueError(f"it has a picture of {opened.width:,} x {opened.height:,} pixels")
-                shown = opened.convert("RGBA")
+                deep = np.asarray(opened) // 257 if opened.mode.startswith("I") else None  # of 16 bits
+                shown = (opened if deep is None else Image.fromarray(deep.astype(np.uint8))).convert("RGBA")
         except UnidentifiedImageError as error:
             kind = ", ".join([str(image.get("mimeType", image.get("name", "")))[:40], *more]).strip(", ")
             raise ValueError(f"its picture {source} ({kind}) is no PNG, JPEG or WebP: export it as one") from error
