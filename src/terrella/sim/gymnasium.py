@@ -116,10 +116,7 @@ class GymnasiumWorld:
     environment cannot be found, made, reset or rendered, and where nothing of its observation is an array."""
 
     def __init__(
-        self,
-        env: str | Callable[[], gymnasium.Env],
-        config: GymnasiumConfig = GymnasiumConfig(),
-        **settings: Any,
+        self, env: str | Callable[[], gymnasium.Env], config: GymnasiumConfig = GymnasiumConfig(), **settings: Any
     ):
         config = replace(config, **settings)
         self._lock = threading.Lock()  # all episodes share one environment, so only one may step at a time

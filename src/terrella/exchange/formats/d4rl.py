@@ -1,6 +1,7 @@
 """Flat HDF5 arrays, as D4RL and OGBench keep them (observations, actions, rewards, terminals, timeouts), cut into episodes."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...data.source import Source, Take
 from . import arrays, flat, hdf5_file, rows
-from .spaces import split_texts
 
 
 def read(path: Path, fps: float | None) -> Source:
@@ -31,14 +31,8 @@ def read(path: Path, fps: float | None) -> Source:
         with hdf5_file.open_file(path) as file:
             episodes = flat.split(_stored(file), str(path))
             for number, span in enumerate(episodes.spans):
-                parts = episodes.cut(number)
-                seen = {place: part for place, part in parts.items() if place in sensors and part.shape}
-                count = max(
-                    part.shape[0] for place, part in seen.items() if rows.role_of(sensors[place].name) != rows.INFO
-                )
-                task, texts = split_texts(episodes.texts_of(number))
-                readings = arrays.readings(seen, sensors, np.arange(count) / rate, str(path))
-                yield Take(readings, task, facts={"rows": list(span), **({"texts": texts} if texts else {})})
+                take = episodes.take(number, sensors, lambda count: np.arange(count) / rate, str(path))
+                yield replace(take, facts={"rows": list(span), **take.facts})
 
     notes += [*more, *episodes.notes, *([flat.BARE] if bare else [])]
     return arrays.source("D4RL's layout", path.stem, sensors, takes, fps=fps, notes=notes, facts={"d4rl": facts})

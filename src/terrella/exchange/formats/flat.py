@@ -5,16 +5,16 @@ The layouts of D4RL (terminals, timeouts), OGBench (terminals; qpos, qvel beside
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...core.errors import DatasetError
-from ...data.source import Sensor
+from ...data.source import Sensor, Take
 from . import arrays, rows
 from .arrays import Array, Place
-from .spaces import is_instruction
+from .spaces import is_instruction, split_texts
 
 SPELLINGS = {  # `rollouts.write` uses the first
     rows.OBSERVATION: ("observations", "observation", "obs"),
@@ -41,6 +41,7 @@ _NUMBERS = (  # of the episode of each row
     "trajectory_id", "trajectory_ids", "demo_id",
 )  # fmt: skip
 _FOLDERS = ("data", "meta")  # of diffusion policy's files
+Times = Callable[[int], np.ndarray]
 BARE = "no array has a name of observations: all that have a row for each step are taken for them."
 
 
@@ -70,9 +71,14 @@ class Episodes:
             parts[place] = _joined(parts[place], _slice(following, stop - 1, stop))
         return parts
 
-    def texts_of(self, number: int) -> dict[Place, list[str]]:
-        """The texts of one episode."""
-        return {place: arrays.texts(self._part(number, place, array)) for place, array in self.texts.items()}
+    def take(self, number: int, sensors: Mapping[Place, Sensor], times: Times, where: str, task: str = "") -> Take:
+        """One episode, whose n rows have the times `times(n)`."""
+        parts = {place: part for place, part in self.cut(number).items() if place in sensors and part.shape}
+        count = max((it.shape[0] for at, it in parts.items() if rows.role_of(sensors[at].name) != rows.INFO), default=0)
+        texts = {place: arrays.texts(self._part(number, place, array)) for place, array in self.texts.items()}
+        task, kept = split_texts(texts, task)
+        facts = {"texts": kept} if kept else {}
+        return Take(arrays.readings(parts, sensors, times(count), where), task, facts=facts)
 
     def _part(self, number: int, place: Place, array: Array) -> Array:
         if len(self.spans) == 1 or not array.shape:

@@ -15,7 +15,6 @@ from ...core.files import creating
 from ...data.source import Sensor, Source, Take
 from . import arrays, flat, rows
 from .arrays import Array, Place
-from .spaces import split_texts
 
 ABOUT = "terrella.json"  # our description, in the folder of the episodes: names, units and frames
 TIME, TASK, START = "time_s", "task", "start_ns"
@@ -131,18 +130,14 @@ def _takes(path: Path, sensors: Mapping[Place, Sensor], fps: float, whole: bool)
     for number, (start, stop) in enumerate(episodes.spans):
         several = len(episodes.spans) > 1
         where = f"{path}, rows {start} to {stop - 1}" if several else str(path)
-        parts = episodes.cut(number)
-        rowwise = [place for place, it in sensors.items() if place in parts and rows.role_of(it.name) != rows.INFO]
-        count = max((parts[place].shape for place in rowwise if parts[place].shape), default=(0,))[0]
-        time_s = _times(path, stored, start, count, several, fps)
-        task, kept = split_texts(episodes.texts_of(number), str(single.get(TASK, "")))
-        facts = {"file": path.name, **({"rows": [start, stop]} if several else {}), **({"texts": kept} if kept else {})}
-        take = Take(arrays.readings(parts, sensors, time_s, where), task, start_ns, facts)
+        times = partial(_times, path, stored, start, several, fps)
+        take = episodes.take(number, sensors, times, where, str(single.get(TASK, "")))
         rows.rows_of(take, where)
-        yield take
+        span = {"rows": [start, stop]} if several else {}
+        yield replace(take, start_ns=start_ns, facts={"file": path.name, **span, **take.facts})
 
 
-def _times(path: Path, stored: Mapping[Place, Array], start: int, count: int, several: bool, fps: float) -> np.ndarray:
+def _times(path: Path, stored: Mapping[Place, Array], start: int, several: bool, fps: float, count: int) -> np.ndarray:
     """The times of the rows of an episode: as stored, else `fps` a second."""
     if (TIME,) not in stored:
         return np.arange(count) / fps

@@ -14,6 +14,7 @@ from .posed import Lens, Shots, absent, pose_of
 from .reading import read_picture
 
 FILES = ("transforms.json", "transforms_train.json")  # the latter in Blender's sets
+_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye")
 _BENDS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FISHEYE")
 
@@ -60,20 +61,7 @@ def read_transforms(path: Path) -> Shots:
 
 def _lens(frame: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens]) -> Lens:
     """The lens of a frame; the same one for the same numbers."""
-    names = (
-        "w",
-        "h",
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "camera_angle_x",
-        "camera_angle_y",
-        *_BENDS,
-        "camera_model",
-        "is_fisheye",
-    )
-    key = tuple(frame.get(name) for name in names)
+    key = tuple(frame.get(name) for name in (*_CAMERA, *_BENDS))
     if key not in cameras:
         model = str(frame.get("camera_model", "OPENCV"))
         if model not in _MODELS:
