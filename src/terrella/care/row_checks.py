@@ -53,9 +53,7 @@ class RowFacts:
     summary: dict[str, stats.Summary] = field(default_factory=dict)
     acted: dict[str, stats.Summary] = field(default_factory=dict)
     padded: dict[str, list[int]] = field(default_factory=dict)  # observation -> the episodes that have no reading of it
-    given: dict[str, stats.Summary] = field(
-        default_factory=dict
-    )  # of these observations, a Summary without the padding
+    given: dict[str, stats.Summary] = field(default_factory=dict)  # of these, a Summary without the padding
     broken: set[str] = field(default_factory=set)  # files with rows that cannot be read
     unlisted: set[str] = field(default_factory=set)  # columns that info.json does not name
 

@@ -46,9 +46,8 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
     """
     frame, remark = _frame(env)
     held, suffix = _held(env)
-    stated = {
-        f"{name}{suffix}": length * held for name, length in (_control(env) | _stepped(env, frame) | frame).items()
-    }
+    declared = _control(env) | _stepped(env, frame) | frame
+    stated = {f"{name}{suffix}": length * held for name, length in declared.items()}
     measured = _measured(env)
     if not measured and not stated:
         return None, "; ".join(["no rate is declared", *remark])

@@ -356,9 +356,7 @@ class Recorder:
             why = "the disk is full" if getattr(error, "errno", None) in FULL else f"writing failed ({error})"
             safe = f"{self.episodes} episodes ({self.rows} frames) are safe there"
             safe += f", the {rows} rows in flight are kept as far as they were written" if rows else ""
-            raise DatasetError(
-                f"{why} at {self.root}; {safe}: {remedy_of(error)} and record again to go on."
-            ) from error
+            raise DatasetError(f"{why} at {self.root}; {safe}: {remedy_of(error)} and record again.") from error
 
     def _stop(self, quietly: bool = False) -> None:
         """Closes the files of the episode in flight."""

@@ -41,13 +41,11 @@ _ALL = {"text", "task", "language", "start_ns", "facts", "sensors"}
 _NO_DATA = ("terrella.json", "readme", "license", "licence")  # names of files, as they begin, that hold no recording
 _LEROBOT = ("meta", "data", "videos", "streams", "images")
 _KINDS: dict[str, _Kind] = {
-    "lerobot": _Kind(
-        "LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL, depth=0
-    ),  # its writer notes what it leaves out
+    "lerobot": _Kind("LeRobot v3", "lerobot.read", "lerobot.write", keeps=_ALL, depth=0),  # its notes name the rest
     "mcap": _Kind("MCAP", "mcap.read", "mcap_write.write", (".mcap",), _ALL - {"text"}),
     "minari": _Kind("Minari", "minari.read", "minari.write", (), ("task", "start_ns", "sensors", "minari", "texts"), 0),
     "robomimic": _Kind(
-        "HDF5", "hdf5.read", "robomimic.write", (".hdf5", ".h5", ".hdf"), ("task", "sensors", "robomimic"), 99
+        "HDF5", "hdf5.read", "robomimic.write", (".hdf5", ".h5", ".hdf"), ("task", "sensors", "robomimic"), 9
     ),
     "rollouts": _Kind("npz rollouts", "rollouts.read", "rollouts.write", (".npz",), ("task", "start_ns", "sensors")),
     "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS, depth=2),

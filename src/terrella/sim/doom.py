@@ -184,7 +184,7 @@ class Doom:
     def _check_present(self, state: State) -> None:
         if int(state["ticket"][0]) != self._ticket:
             raise StaleStateError(
-                f"{self.spec.name} has moved on since this state; it cannot go back (forkable=False)."
+                f"{self.spec.name} has moved on since this state and cannot go back (forkable=False)."
             )
 
     def _advance(self) -> State:

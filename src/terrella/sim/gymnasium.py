@@ -202,9 +202,7 @@ class GymnasiumWorld:
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """The prior, or a start: a simulator cannot be set from an observation."""
         if observation:
-            raise ObservationError(
-                f"{self.spec.name} is a simulator and accepts no observation; pass an empty mapping."
-            )
+            raise ObservationError(f"{self.spec.name} is a simulator and takes no observation; pass an empty mapping.")
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
@@ -354,13 +352,7 @@ class GymnasiumWorld:
         what = f"the Gymnasium environment {self._name.removeprefix('gym:')}"
         how = {**facts.how, **({"pictures": self._drawn.form} if self._drawn.form else {})}
         how |= {"task": f"the text '{label_of(self._parts.text)}'"} if self._parts.text is not None else {}
-        card = {
-            "what": what,
-            "kind": "simulator",
-            "how": how,
-            "renamed": self._parts.renamed,
-            "left_out": dict(left_out),
-        }
+        card = {"what": what, "kind": "simulator", "how": how, "renamed": self._parts.renamed, "left_out": {**left_out}}
         return Spec(
             name=self._name,
             action=self._env.action_space,

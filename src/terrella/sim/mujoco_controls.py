@@ -32,9 +32,7 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
     """The controls of a model whose pose at rest is `qpos` [nq]. Limits that the file does not state hold the pose at rest, and
     whatever the servo's joint, tendon or force can reach. TerrellaError for actuators that take several numbers."""
     if len(model.actuator_gainprm) != model.nu:
-        raise TerrellaError(
-            "the file has actuators that take several controls (pid, SO3); use position or motor instead."
-        )
+        raise TerrellaError("actuators of several controls (pid, SO3) are not read; use position or motor.")
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_fwdPosition(model, data)
@@ -48,9 +46,8 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
         if limits[at, 0] == limits[at, 1]:
             limits[at], why = _limits(model, data, at, kinds[at])
         low, high = limits[at] = min(limits[at, 0], rest[at]), max(limits[at, 1], rest[at])
-        chosen.append(
-            f"{control_name(model, at)} {low:.4g} to {high:.4g} {control_unit(model, at)}".rstrip() + f" ({why})"
-        )
+        about = f"{control_name(model, at)} {low:.4g} to {high:.4g} {control_unit(model, at)}"
+        chosen.append(f"{about.rstrip()} ({why})")
     low, high = limits[:, 0], limits[:, 1]
     rest = np.clip(rest, low, high)
     return ControlLimits(low, high, rest, _activations(model, kinds, rest, hold), tuple(chosen))

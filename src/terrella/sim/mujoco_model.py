@@ -131,9 +131,8 @@ def _weights(model: mujoco.MjModel) -> list[float]:
         pull, axis = model.body_subtreemass[body] * model.opt.gravity, data.xaxis[at]
         arm = np.cross(axis, data.subtree_com[body] - data.xanchor[at])
         slides = model.jnt_type[at] == int(SLIDE)
-        weights.append(
-            float(abs(pull @ axis) if slides else np.linalg.norm(arm) * np.linalg.norm(np.cross(axis, pull)))
-        )
+        turns = np.linalg.norm(arm) * np.linalg.norm(np.cross(axis, pull))
+        weights.append(float(abs(pull @ axis) if slides else turns))
     return weights
 
 
@@ -165,9 +164,8 @@ def coupled_joints(model: mujoco.MjModel) -> list[dict[int, tuple[float, float]]
 def _joint_equalities(model: mujoco.MjModel) -> list[tuple[int, int, list[float]]]:
     """Active equality constraints of joints: the joint, the one that it follows (-1: none), and the polynomial."""
     active = (model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & model.eq_active0.astype(bool)
-    return [
-        (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), model.eq_data[k].tolist()) for k in np.flatnonzero(active)
-    ]
+    rows = zip(model.eq_obj1id[active], model.eq_obj2id[active], model.eq_data[active])
+    return [(int(one), int(other), data.tolist()) for one, other, data in rows]
 
 
 def _held_joints(model: mujoco.MjModel, groups: list[dict[int, tuple[float, float]]]) -> list[int]:

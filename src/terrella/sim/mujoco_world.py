@@ -323,9 +323,7 @@ class MujocoWorld:
             units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
         lenses = {camera: lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
         cameras = {f"rgb{suffix[camera]}": one for camera, one in lenses.items() if one is not None}
-        notes = [
-            f"camera {camera} is no pinhole: it has no intrinsics" for camera, one in lenses.items() if one is None
-        ]
+        notes = [f"camera {name} is no pinhole: it has no intrinsics" for name, one in lenses.items() if one is None]
         if chosen := self._controls.chosen:
             notes.append(f"limits of controls that the file does not state: {', '.join(chosen)}")
         return Spec(

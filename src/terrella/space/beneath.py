@@ -71,9 +71,8 @@ def _around(points, low, high) -> tuple[list[bool], float, int]:
     cells = ((high - low) / CELL_M).round().clamp_min(1)
     outside = torch.where(points < low, ((points - low) / CELL_M).floor(), cells + ((points - high) / CELL_M).floor())
     inside = (points >= low) & (points <= high)
-    at = torch.where(
-        inside, ((points - low) / (high - low).clamp_min(1e-9) * cells).floor().minimum(cells - 1), outside
-    )
+    within = ((points - low) / (high - low).clamp_min(1e-9) * cells).floor().minimum(cells - 1)
+    at = torch.where(inside, within, outside)
     sides, area, many = [], 0.0, 0
     for k in range(2):
         for beyond in (points[:, k] < low[k], points[:, k] > high[k]):

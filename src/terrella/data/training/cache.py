@@ -268,9 +268,8 @@ def absent_of(dataset: Dataset) -> dict[str, list[int]]:
     for number, episode in enumerate(dataset.episodes):
         for feature in episode.absent:
             absent.setdefault(arrays.get(feature, current_feature(feature)), []).append(number)
-    return {
-        name: numbers for name, numbers in absent.items() if name != "done" and len(numbers) < len(dataset.episodes)
-    }
+    every = len(dataset.episodes)
+    return {name: numbers for name, numbers in absent.items() if name != "done" and len(numbers) < every}
 
 
 def episodes_with(channels: Iterable[str], numbers: np.ndarray, absent: Mapping[str, Sequence[int]]) -> np.ndarray:

@@ -42,9 +42,8 @@ def from_env(
         for root, space in (("observations", observation), ("actions", action))
         for place, leaf in spaces.leaves(space, root, name).items()
     }
-    known = {place: leaf for place, leaf in leaves.items() if leaf} | dict.fromkeys(
-        _FOLLOW, Array((0,), np.dtype(float))
-    )
+    known = {place: leaf for place, leaf in leaves.items() if leaf}
+    known |= dict.fromkeys(_FOLLOW, Array((0,), np.dtype(float)))
     sensors, notes = arrays.columns(known, partial(arrays.sensor_at, arrays.GYMNASIUM), name)
     if ";" in clock and fps is None:
         notes.append(f"the step length of {name} is {clock}.")

@@ -182,9 +182,7 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
         starts, flag = _are_starts((head,), array, count), NAMES.get(str(head)) in (rows.DONE, rows.TRUNCATED)
         if flag and math.prod(array.shape[1:]) > 1:
             has = f"{list(array.shape)} numbers, and one for each step is needed"
-            raise DatasetError(
-                f"'{head}' in {where} has {has}: store the episodes one after another, or a file for each."
-            )
+            raise DatasetError(f"'{head}' in {where} has {has}: store episodes one after another, or a file each.")
         if starts or head in (*_ENDS, *_LENGTHS):
             values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
             stops = np.cumsum(values) if head in _LENGTHS else values + (values.max(initial=0) == count - 1)

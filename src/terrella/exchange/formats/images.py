@@ -52,9 +52,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
             Take(
                 {names[c]: _images(files, sensors[names[c]], fps) for c, files in folder.items()},
                 facts={"folder": name},
-                notes=tuple(
-                    dict.fromkeys(note for files in folder.values() for file in files for note in _losses(file))
-                ),
+                notes=tuple(dict.fromkeys(note for part in folder.values() for file in part for note in _losses(file))),
             )
             for name, folder in takes.items()
         ),

@@ -93,9 +93,7 @@ def _with_file_names(source: Source) -> tuple[Source, list[str]]:
     names: dict[str, str] = {}
     for name in sorted(source.sensors, key=lambda name: file_name(name) != name):  # good names stay
         names[name] = rows.unique(file_name(name), names.values())
-    notes = [
-        f"'{name}' is '{now}' in LeRobot, whose names are file names." for name, now in names.items() if name != now
-    ]
+    notes = [f"'{name}' is '{now}' in LeRobot, where it names a file." for name, now in names.items() if name != now]
     if not notes:
         return source, []
     sensors = {names[name]: replace(sensor, name=names[name]) for name, sensor in source.sensors.items()}
@@ -166,9 +164,8 @@ def _layout(source: Source, first: Take, lead: str, how: LeRobotRows) -> tuple[L
         if sensor.kind != "points" and 0 in sensor.shape:
             notes.append(f"{name} was left out: it has no numbers")
             continue
-        reserved = sensor.kind == "points" or (
-            sensor.rate_hz is not None and whole_rate(sensor.rate_hz) != whole_rate(rate)
-        )
+        own_rate = sensor.rate_hz is not None and whole_rate(sensor.rate_hz) != whole_rate(rate)
+        reserved = sensor.kind == "points" or own_rate
         if sensor.kind == "image" and (sensor.shape[0] % 2 or sensor.shape[1] % 2) and pictures == "video":
             pictures = "png"
             notes.append(f"{name} is {sensor.shape[0]}x{sensor.shape[1]}, and H.264 needs even sizes: pictures are PNG")

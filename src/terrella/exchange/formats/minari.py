@@ -104,9 +104,8 @@ def _take(episode: StoredEpisode, where: str, sensors: Mapping, shapes: Shapes, 
     rows.rows_of(Take(readings), where)
     facts = episode.facts()
     task, start_ns = facts.pop("task", ""), facts.pop("start_ns", None)
-    task, kept = spaces.split_texts(
-        {place: episode.texts(place) for place in texts}, task if isinstance(task, str) else ""
-    )
+    of_places = {place: episode.texts(place) for place in texts}
+    task, kept = spaces.split_texts(of_places, task if isinstance(task, str) else "")
     return Take(
         readings,
         task=task,

@@ -83,9 +83,7 @@ def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
     if "mask" not in file:
         return {}
     parts = dict(hdf5_file.all_datasets(hdf5_file.subgroup(file, "mask")))
-    return {
-        arrays.spelled(place): hdf5_file.read_strings(part) for place, part in parts.items() if part.dtype.kind in "OS"
-    }
+    return {arrays.spelled(place): hdf5_file.read_strings(it) for place, it in parts.items() if it.dtype.kind in "OS"}
 
 
 def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:

@@ -46,9 +46,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     sensors, notes = arrays.columns(stored, partial(flat.guess, bare), "the key", own)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
         keys = ", ".join(map(arrays.spelled, every[0].stored)) or "nothing"
-        raise DatasetError(
-            f"{files[0]} has no observations; it holds {keys}, not observations or obs.NAME. {' '.join(notes)}"
-        )
+        raise DatasetError(f"{files[0]} has no observations; it holds {keys}, not obs or obs.NAME. {' '.join(notes)}")
     notes += [*([flat.BARE] * bare), *(every[0].notes if len(files) == 1 else ())]
 
     def takes(rate: float) -> Iterator[Take]:

@@ -108,9 +108,7 @@ def to_stored(values: np.ndarray, sensor: Sensor) -> np.ndarray:
 def check_size(height: int, width: int, what: str) -> None:
     """DatasetError for a picture that is too large to be real (a damaged or hostile file)."""
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE and height * width <= MAX_PIXELS):
-        raise DatasetError(
-            f"{what} is {width} x {height}; more than {MAX_PIXELS >> 20} megapixels are not read: scale it down."
-        )
+        raise DatasetError(f"{what} is {width} x {height}; scale it to {MAX_PIXELS >> 20} megapixels or less.")
 
 
 def metres(depth_mm: np.ndarray) -> np.ndarray:

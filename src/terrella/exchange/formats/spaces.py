@@ -9,7 +9,7 @@ from gymnasium import spaces
 from ...core.errors import DatasetError
 from ...core.instruction import TASK_NAMES
 from ...data.source import Sensor
-from .arrays import Array, Place
+from .arrays import Array, Place, spelled
 from .rows import stored_shape
 
 _NO_ARRAYS = ("Sequence", "Graph", "OneOf", "Unknown")  # spaces whose values are not arrays of one shape
@@ -54,9 +54,8 @@ def split_texts(texts: Mapping[Place, Sequence[str]], task: str = "") -> tuple[s
     named = [text for place, text in constant.items() if text and is_instruction(place)]
     only = [text for text in constant.values() if text]
     task = task or (named[0] if named else only[0] if len(only) == 1 else "")
-    return task, {
-        "/".join(map(str, place)): list(values) for place, values in texts.items() if constant.get(place) != task
-    }
+    kept = {place: list(values) for place, values in texts.items() if constant.get(place) != task}
+    return task, {spelled(place): values for place, values in kept.items()}
 
 
 def _shape_of(kind: str, space) -> tuple[tuple[int, ...], str]:

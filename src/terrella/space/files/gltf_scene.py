@@ -256,9 +256,8 @@ def _skinned(
     skin = file.named("skins", node["skin"])
     joints = np.stack([places[joint] for joint in skin["joints"]])
     if "inverseBindMatrices" in skin:
-        joints = (
-            joints @ file.numbers(skin["inverseBindMatrices"], 16).reshape(-1, 4, 4).transpose(0, 2, 1)[: len(joints)]
-        )
+        inverse = file.numbers(skin["inverseBindMatrices"], 16)[: len(joints)]
+        joints = joints @ inverse.reshape(-1, 4, 4).transpose(0, 2, 1)
     whole, total = np.concatenate([points, np.ones((len(points), 1))], 1), np.zeros((len(points), 4))
     for group in range(MOST_JOINTS):
         if f"JOINTS_{group}" not in given:

@@ -30,9 +30,8 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
 
 def other_elements(data: bytes) -> list[str]:
     """Elements of a PLY beside points and what belongs to Gaussians, such as the faces of a mesh, with their numbers."""
-    return [
-        f"{count:,} {name}s" for name, count, _ in _header(data)[1] if count and name not in ("vertex", "chunk", "sh")
-    ]
+    others = [(name, count) for name, count, _ in _header(data)[1] if name not in ("vertex", "chunk", "sh")]
+    return [f"{count:,} {name}s" for name, count in others if count]
 
 
 def other_columns(rows: np.ndarray) -> list[str]:
@@ -142,9 +141,7 @@ def full_scale(kind: np.dtype, most: float) -> float:
     """The number that stands for full brightness where `most` is the largest: the first that is as large of 1, 255 and 65,535
     (floats), or of 255, 65,535 and the largest number of the type (integers)."""
     if kind.kind == "f":
-        return next(
-            (level for level in (1.0, 255.0, 65535.0) if most <= 1.5 * level), most
-        )  # some are slightly too bright
+        return next((level for level in (1.0, 255.0, 65535.0) if most <= 1.5 * level), most)  # highlights
     largest = float(np.iinfo(kind).max)
     return next(level for level in (255.0, min(65535.0, largest), largest) if most <= level)
 

@@ -34,9 +34,7 @@ def spellings(name: str) -> list[str]:
 
 def _with_ending(file: Path) -> Path | None:
     ends = ("",) if file.suffix.lower() in ENDINGS else ("", *ENDINGS)
-    return (
-        next((one for end in ends if (one := file.with_name(file.name + end)).is_file()), None) if file.name else None
-    )
+    return next((one for end in ends if file.name and (one := file.with_name(file.name + end)).is_file()), None)
 
 
 def _by_tail(home: Path) -> dict[str, list[Path]]:

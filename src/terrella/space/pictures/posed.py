@@ -96,9 +96,7 @@ def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:
     that were left out."""
     if len(shots.files) < FEWEST:
         lost = f" (left out: {', '.join(shots.left_out[:5])})" if shots.left_out else ""
-        raise DatasetError(
-            f"there are {len(shots.files)} posed pictures{lost}, and a fit needs {FEWEST} or more; take more."
-        )
+        raise DatasetError(f"there are {len(shots.files)} posed pictures{lost}; take {FEWEST} or more.")
     boxes = np.stack([lens.extent() for lens in set(shots.lenses)])
     left, top, right, bottom = *boxes[:, :2].max(0), *boxes[:, 2:].min(0)
     if right - left < 0.05 or bottom - top < 0.05:

@@ -37,9 +37,7 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is not there; put it back, or take it off the list.") from error
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DatasetError(
-            f"{path} cannot be read as a picture; save it again as JPEG or PNG, or take it away."
-        ) from error
+        raise DatasetError(f"{path} cannot be read as a picture; save it as JPEG or PNG, or take it away.") from error
     picture = _rgb(picture)
     share = longest / max(picture.size)
     if share < 1:
