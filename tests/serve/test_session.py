@@ -127,6 +127,27 @@ def test_pausing_stops_time():
     play(scenario)
 
 
+def test_a_world_in_which_every_action_does_something_waits_for_the_first_key(monkeypatch):
+    monkeypatch.setattr("terrella.serve.session.can_idle", lambda spec: False)
+
+    async def scenario(session):
+        socket = FakeSocket(session)
+        session.attach(socket)
+        await until(lambda: any(event.get("waits") for event in socket.events))
+        await asyncio.sleep(0.05)
+        assert socket.last.step == 0
+        session.hear("controls", HeldControls(1, ("KeyW",)))
+        await until(lambda: socket.last.step > 3)
+        session.hear("controls", HeldControls(2))
+        await until(lambda: socket.last.step > 9)
+        session.hear("restart", 5)
+        await until(lambda: socket.last.step == 0)
+        await asyncio.sleep(0.05)
+        assert socket.last.step == 0 and socket.events[-1]["waits"]
+
+    play(scenario)
+
+
 def test_rewind_then_branch_goes_on_from_there():
     async def scenario(session):
         socket = FakeSocket(session)

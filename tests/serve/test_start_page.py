@@ -138,8 +138,8 @@ def test_a_click_opens_a_world_and_its_mark_leads_back(browser):
 def test_a_folder_has_its_worlds_places_and_recordings(tmp_path):
     for folder, text in (
         ("runs/maze/world/world.json", {"kind": "learned", "about": {}, "card": {"what": "of a maze"}}),
-        ("places/hall/world.json", {"kind": "splat", "card": {}}),
-        ("recordings/walk/meta/info.json", {"total_episodes": 3, "total_frames": 1200}),
+        ("places/hall/world.json", {"kind": "splat", "name": "a wide hall", "card": {}}),
+        ("recordings/walk/meta/info.json", {"total_episodes": 1, "total_frames": 1200}),
         ("recordings/broken/meta/info.json", ["no"]),
         (".cache/hidden/world.json", {"kind": "splat"}),
         ("node_modules/x/world.json", {"kind": "splat"}),
@@ -151,8 +151,8 @@ def test_a_folder_has_its_worlds_places_and_recordings(tmp_path):
     mine = {(card.title, card.section, card.text) for card in shelf.cards() if card.section not in ("bundled", "game")}
     assert mine == {
         ("runs/maze", "world", "of a maze"),
-        ("places/hall", "place", ""),
-        ("recordings/walk", "recording", "3 episodes, 1,200 frames"),
+        ("a wide hall", "place", "places/hall"),
+        ("recordings/walk", "recording", "1 episode, 1,200 frames"),
     }
     assert {card.name for card in shelf.cards() if card.section == "bundled"} >= {"doom-maze", "doom-corridor"}
     assert shelf.thumbnail("doom-maze")[:2] == b"\xff\xd8"

@@ -59,7 +59,7 @@ class WithTables(Toy):
         return ["NOOP", "UP", "DOWN"]
 
     def get_keys_to_action(self):
-        return {"i": 1, ("k",): 2}
+        return {"i": 1, ("k",): 2, "n": 0}
 
 
 def test_names_keys_rest_and_clock_are_the_environments_own():

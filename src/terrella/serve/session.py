@@ -14,6 +14,7 @@ from typing import Any
 from starlette.websockets import WebSocket
 
 from ..core.errors import TerrellaError
+from ..core.spec import can_idle
 from . import protocol
 from .actions import MAX_AXES, axes_of, keys_of
 from .chart import EVERY_S
@@ -159,10 +160,15 @@ class Session:
             await self._wake.wait()
         elif self._unseen is not None:
             await self._send(self._unseen, timeline, 0.0, self._controls)
-        elif self._paused or self._error or timeline.rewound:
+        elif self._paused or self._error or timeline.rewound or self._awaits_key(timeline):
             await self._wake.wait()
         else:
             await self._step_when_due(timeline)
+
+    def _awaits_key(self, timeline: Timeline) -> bool:
+        """Whether an episode waits for the first key, because every action of the world does something."""
+        touched = self._controls.held or self._controls.axes or timeline.driver.on
+        return timeline.shown.age == 0 and not touched and not can_idle(timeline.spec)
 
     async def _step_when_due(self, timeline: Timeline) -> None:
         loop, now = asyncio.get_running_loop(), time.perf_counter()
@@ -261,6 +267,7 @@ class Session:
             status |= {
                 "paused": self._paused, "rewound": timeline.rewound, "recording": timeline.recording.on,
                 "driving": timeline.driver.on, "seed": timeline.seed, "notice": timeline.notice,
+                "waits": self._awaits_key(timeline),
             }  # fmt: skip
         if timeline is not None or self._error:
             await self._send_changed("status", status)

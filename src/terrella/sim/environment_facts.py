@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from ..core.keys import default_keys, parse_keys
+from ..core.spec import idle_name
 from ..core.step_length import step_length
 
 _NAMERS = ("get_action_meanings", "action_meanings", "get_action_names", "action_names", "get_combos")
@@ -36,6 +37,9 @@ def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
     how = {"action names": source or "without names", "frame rate": clock if dt_s else f"{clock}, so {DEFAULT_FPS}"}
     table = _called(getattr(bare, "get_keys_to_action", None)) or getattr(bare, "keys_to_action", None)
     keys = parse_keys(table, space) if isinstance(table, Mapping) else {}
+    idle = idle_name(labels)
+    if isinstance(space, spaces.Discrete) and idle is not None:  # no key is pressed for it
+        keys = {code: action for code, action in keys.items() if action != [idle + space.start]}
     how["keys"] = "get_keys_to_action" if keys else "by the actions' names" if labels else "default"
     return EnvironmentFacts(labels, keys or default_keys(space, labels), dt_s or 1 / DEFAULT_FPS, how)
 

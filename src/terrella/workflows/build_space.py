@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import re
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
@@ -145,13 +147,19 @@ def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResu
         "world": str(out), "gaussians": len(place.gaussians), "rooms": len(parsed.layout.rooms), "objects": list(place.names),
         "movable": movable, "not_understood": list(parsed.unknown), "no_place_for": list(parsed.left_out),
     }  # fmt: skip
-    contents = ", ".join(place.names) or "nothing"
-    lines = [f"{len(place.gaussians):,} Gaussians, {len(parsed.layout.rooms)} room(s), {contents} in them"]
+    contents = [amount(many, name) for name, many in Counter(place.names).items()]
+    lines = [", ".join([f"{len(place.gaussians):,} Gaussians", amount(len(parsed.layout.rooms), "room"), *contents])]
     if movable:
         without = "" if find_spec("mujoco") else " (once MuJoCo is installed: pip install 'terrella[mujoco]')"
         lines.append(f"can be pushed: {', '.join(movable)}{without}")
     lines += unheeded(facts)
     return SpaceResult(facts, (*lines, f"walk in it: terrella play {out}"))
+
+
+def amount(many: int, what: str) -> str:
+    """A number of things in words: "1 room", "1,200 frames"."""
+    plural = what if what.endswith("s") else re.sub("(ch|sh|x)$", r"\1e", re.sub("f$", "ve", what)) + "s"
+    return f"{many:,} {what if many == 1 else plural}"
 
 
 def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildSpaceConfig) -> None:

@@ -19,7 +19,7 @@ from ..serve.place_page import build_place
 from ..serve.server import Sessions, build_app
 from ..serve.start_page import Build, StartCard, serve_start
 from ..serve.viewer import build_viewer
-from .build_space import BuildSpaceConfig, build_space
+from .build_space import BuildSpaceConfig, amount, build_space
 from .opening import ControlsConfig
 from .play import PlayConfig, first_seed, prepared
 from .progress import Progress, silent
@@ -86,7 +86,8 @@ class FolderShelf:
         return lambda host, token: build_app(sessions, host, token)
 
     def build(self, words: str) -> str:
-        stem = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:LONGEST_NAME].strip("-") or "place"
+        stem = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
+        stem = (stem if len(stem) <= LONGEST_NAME else stem[:LONGEST_NAME].rpartition("-")[0]) or "place"
         names = (f"{stem}-{number}" if number > 1 else stem for number in range(1, 1000))
         out = next(out for name in names if not (out := self._folder / "places" / name).exists())
         build_space(None, out, BuildSpaceConfig(text=words))
@@ -141,18 +142,23 @@ def _card_of(folder: Path, root: Path) -> StartCard | None:
                 section, text = read(json.loads(file.read_text(encoding="utf-8")))
             except (OSError, ValueError, AttributeError, TypeError):
                 return None
-            name = folder if folder.name != "world" else folder.parent
-            return StartCard(str(folder), str(name.relative_to(root)), section, text)
+            title = str((folder if folder.name != "world" else folder.parent).relative_to(root))
+            return StartCard(
+                str(folder), *((text, section, title) if section == "place" and text else (title, section, text))
+            )
     return None
 
 
 def _recording_text(info: dict) -> tuple[str, str]:
-    return "recording", f"{int(info['total_episodes']):,} episodes, {int(info['total_frames']):,} frames"
+    return "recording", ", ".join(amount(int(info[f"total_{what}s"]), what) for what in ("episode", "frame"))
 
 
 def _world_text(about: dict) -> tuple[str, str]:
+    """(section, text); of a place its name."""
     what = (about.get("about") or about).get("card") or about.get("card") or {}
-    return "place" if about.get("kind") == "splat" else "world", str(what.get("what", ""))
+    if about.get("kind") == "splat":
+        return "place", str(about.get("name", ""))
+    return "world", str(what.get("what", ""))
 
 
 def _picture_of_recording(name: str):

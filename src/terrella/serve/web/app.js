@@ -98,6 +98,7 @@ function onStatus(body) {
   if (body.notice && body.notice !== status.notice) toast(/^saved/.test(body.notice) && recordIn ? `${body.notice.slice(0, -1)} to ${recordIn}.` : body.notice);
   if (body.recording && !status.recording) recordSince = performance.now();
   status = body;
+  if (body.waits) $('hint').classList.add('show');
   app.classList.toggle('recording', !!body.recording);
   $('record').setAttribute('aria-pressed', !!body.recording);
   if (body.seed !== undefined && document.activeElement !== $('seed')) $('seed').value = body.seed;
@@ -212,7 +213,7 @@ function hint() {
   const axes = !world.axes.length ? [] : [make('span', touch || !screens.cameras.length ? 'Move a slider' : 'Move a slider, or click the picture and move the mouse')];
   $('hint').replaceChildren(...(touch && !world.axes.length ? [make('span', ['Put a thumb on a stick', ...controls.plan.extra.slice(0, 2).map((code) => `press “${keyMeaning(world, code)}”`)].join(', '))] : [...keys, ...axes]));
   $('hint').classList.toggle('show', $('hint').childElementCount > 0 && world.actions.length + world.axes.length > 0);
-  setTimeout(() => $('hint').classList.remove('show'), 20000);
+  setTimeout(() => $('hint').classList.toggle('show', !!status.waits), 20000);
 }
 
 const STATES = {
@@ -325,7 +326,7 @@ function drawTouch() {
 
 // -- wiring ---------------------------------------------------------------------------------------------------------
 
-const escape = () => (panel.open ? showAside(null) : togglePause());
+const escape = () => (panel.open || card.open ? showAside(null) : togglePause());
 const SHORTCUTS = { KeyM: () => views.toggleMap(), KeyT: () => views.toggleTint(), KeyC: () => views.nextCamera(), KeyG: () => driver.toggle(), KeyV: () => futures.toggle(), KeyB: () => goal.keep(), KeyP: togglePause, Escape: escape, KeyR: restartTyped, Enter: () => status.rewound && link.send({ type: 'branch' }), KeyF: fullscreen };
 
 /** What the page itself does with a key, here and now; '' where it does nothing. */

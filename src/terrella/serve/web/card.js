@@ -34,7 +34,7 @@ function plainly({ card, dt_s: dt, cameras, mapped }) {
   const frames = Number(String(card.data ?? '').match(/^([\d,]+) frames/)?.[1].replaceAll(',', ''));
   const [height, width] = cameras[0].size, learned = card.kind === 'learned' || card.kind === 'latent';
   return [
-    ['Learned from', frames ? `${card.data}: ${time(frames * dt)} of play` : card.data],
+    ['Trained on', frames ? `${card.data}: ${time(frames * dt)} of play` : card.data],
     ['Trained for', card.hours ? `${time(3600 * card.hours)}${/CPU/.test(card.hardware ?? '') ? ' on a CPU' : ''}` : null],
     ['Its network', card.parameters ? `${large(card.parameters)} weights` : null],
     ['Pictures', `${width} × ${height} pixels, ${Math.round(1 / dt)} steps a second`],

@@ -275,9 +275,14 @@ async function keep(lines, saved) {
 }
 
 function greet() {
-  const caps = (text) => text.split(' ').flatMap((cap) => [Object.assign(document.createElement('kbd'), { textContent: cap }), ' ']);
+  const make = (tag, textContent) => Object.assign(document.createElement(tag), { textContent });
+  const part = (caps, word) => {
+    const span = make('span', '');
+    span.append(...caps.map((cap) => make('kbd', cap)), make('em', word));
+    return span;
+  };
   const touch = matchMedia('(pointer: coarse)').matches;
-  $('hint').replaceChildren(...(touch ? ['Left thumb walks, right thumb looks'] : [...caps('W A S D'), 'to walk, drag to look, ', ...caps('Space'), 'lifts off, ', ...caps('C'), 'comes down']));
+  $('hint').replaceChildren(...(touch ? ['Left thumb walks, right thumb looks'] : [part([...'WASD'], 'walk'), part([], 'drag to look'), part(['Space'], 'up'), part(['C'], 'down')]));
   $('hint').classList.add('show');
   setTimeout(() => $('hint').classList.remove('show'), 8000);
 }
