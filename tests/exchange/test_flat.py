@@ -95,9 +95,13 @@ def test_records_of_several_fields_and_files_without_observations_are_read(tmp_p
     (first, *_) = open_source(tmp_path / "a.npz").takes()
     np.testing.assert_array_equal(first.readings["observation.position"].values[:, 2], np.arange(5))
     assert first.readings["observation.grip"].values.tolist() == [[7]] * 5
-    saved(tmp_path / "b.npz", {"data/action": ACTION, "data/state": STATE, "meta/episode_ends": np.array([5, 9, 12])})
+    more = {"data/is_last": LAST, "data/discount": np.ones(ROWS), "meta/episode_ends": np.array([5, 9, 12])}
+    saved(tmp_path / "b.npz", {"data/action": ACTION, "data/state": STATE, **more})
     source = open_source(tmp_path / "b.npz")
-    assert set(source.sensors) == {"action", "observation.state"} and len(list(source.takes())) == 3
+    assert (
+        set(source.sensors) == {"action", "observation.state", "info.is_last", "info.discount"}
+        and len(list(source.takes())) == 3
+    )
     assert any("no array has a name of observations" in note for note in source.notes)
 
 

@@ -5,6 +5,7 @@ import inspect
 import math
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from operator import attrgetter
 from textwrap import dedent
 from typing import Any
@@ -57,6 +58,21 @@ def step_length(env: gymnasium.Env) -> tuple[float | None, str]:
     return seconds, "; ".join([f"its {chosen}", *differing, *(["--fps sets another"] if differing else []), *remark])
 
 
+def infos_of_step(env: gymnasium.Env) -> list[str]:
+    """The keys of `info` after a step of an environment that was reset; [] where the step fails."""
+    with suppress(Exception):  # foreign code: its own errors are reported where it is stepped in earnest
+        return [str(key) for key in env.step(_trial(env))[4]]
+    return []
+
+
+def _trial(env: gymnasium.Env) -> Any:
+    """An action that does nothing, or a middle one. Of a Dict or Tuple, which no Spec has, any."""
+    try:
+        return neutral_action(Spec("trial", env.action_space, {}, (), 1.0))[()]
+    except TerrellaError:
+        return env.action_space.sample()
+
+
 def _measured(env: gymnasium.Env) -> dict[str, float]:
     """{clock: seconds that each step advances it}; {} where no clock is one."""
     clocks = {name: now for name in (*_SIMULATORS, *_CLOCKS) if isinstance(now := _at(env, name), float)}
@@ -64,7 +80,7 @@ def _measured(env: gymnasium.Env) -> dict[str, float]:
         return {}
     times = {name: [now] for name, now in clocks.items()}
     try:
-        action = neutral_action(Spec("trial", env.action_space, {}, (), 1.0))[()]
+        action = _trial(env)
         for _ in range(_TRIAL_STEPS):
             _, _, terminated, truncated, _ = env.step(action)
             for name, seen in times.items():

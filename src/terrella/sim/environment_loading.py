@@ -5,14 +5,13 @@ import re
 import runpy
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 
 from ..core.errors import TerrellaError
-from ..core.spec import Spec, neutral_action
 from . import islet  # noqa: F401  it registers Islet-v0
 from .drawn_pictures import DrawnPictures
 
@@ -128,13 +127,6 @@ def first_picture(env: gymnasium.Env, name: str, pictures: DrawnPictures) -> tup
     except TerrellaError as error:
         return None, str(error)
     return (height, width), ""
-
-
-def infos_of_step(env: gymnasium.Env) -> list[str]:
-    """The keys of `info` after a step of an environment that was reset; [] where the step fails."""
-    with suppress(Exception):  # foreign code: its own errors are reported where it is stepped in earnest
-        return [str(key) for key in env.step(neutral_action(Spec("trial", env.action_space, {}, (), 1.0))[()])[4]]
-    return []
 
 
 def load_adapter(source: str) -> Any:

@@ -18,10 +18,11 @@ from ..core.instruction import embed, text_to_bytes
 from ..core.numbers import single_number
 from ..core.spec import DONE, INSTRUCTION, REWARD, TEXT, Camera, Spec, kind_of
 from ..core.state import State
+from ..core.step_length import infos_of_step
 from ..core.world import make_rng
 from .drawn_pictures import DrawnPictures
 from .environment_facts import EnvironmentFacts, facts_of
-from .environment_loading import build, explained, first_picture, infos_of_step, renders_pictures
+from .environment_loading import build, explained, first_picture, renders_pictures
 from .observation_channels import check_space, entry_at, label_of, parts_of, resized, space_of, value_at
 from .processes import MAX_EPISODES, Processes
 from .snapshot import NotCopyable, Snapshots

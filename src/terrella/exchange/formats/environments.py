@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...core.numbers import single_number
-from ...core.step_length import step_length
+from ...core.step_length import infos_of_step, step_length
 from ...data.source import Sensor, Source, Take
 from . import arrays, rows, spaces
 from .arrays import Array, Place
@@ -25,7 +25,7 @@ def from_env(
     fps: rows per second. Default: from what the environment says of its steps (core/step_length.py), else rows.FPS_UNKNOWN.
 
     An episode is truncated after 1000 steps. There is one more observation than actions: the last one is kept. Spaces are
-    flattened as in minari.read; notes name the parts of observations that are no arrays, and the infos of `reset`.
+    flattened as in minari.read; notes name the parts of observations that are no arrays, and infos.
     DatasetError for unknown ids, and for an action or a whole observation that is no array.
     """
     if episodes < 1:
@@ -35,6 +35,7 @@ def from_env(
     observation, action = spaces.to_json(made.observation_space), spaces.to_json(made.action_space)
     infos = made.reset(seed=seed)[1]
     seconds, clock = step_length(made)
+    infos = dict.fromkeys([*infos, *infos_of_step(made)])
     stated = {"fps": seconds and 1 / seconds}
     made.close()
     leaves = {

@@ -40,9 +40,10 @@ _NUMBERS = (  # of the episode of each row
     "episode_index", "episode_id", "episode_ids", "episode", "episode_num", "ep_idx", "traj_id", "traj_ids",
     "trajectory_id", "trajectory_ids", "demo_id",
 )  # fmt: skip
+_COUNTERS = ("step_idx", "step", "timestep", "frame_index", "discount", "valids", "masks")
 _FOLDERS = ("data", "meta")  # of diffusion policy's files
 Times = Callable[[int], np.ndarray]
-BARE = "no array has a name of observations: all that have a row for each step are taken for them."
+BARE = "no array has a name of observations: others with a row for each step are taken for them."
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,11 @@ def home(place: Place) -> Place:
 
 def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     """The sensor of an array with a row for each step. One of an unknown name is a picture, if its bytes look like one; else
-    "info.NAME", or an observation if `bare`: no array has a name of observations."""
+    "info.NAME", or an observation if `bare` (no array has a name of observations) and its name is not about steps."""
     if place[0] in NAMES:
         return arrays.sensor_at(NAMES, place, shape, dtype)
-    observed = bare or rows.picture_layout(shape, dtype) is not None
+    about_steps = place[0] in (*_LAST, *_FIRST, *_NUMBERS, *_COUNTERS, _STEP_TYPE)
+    observed = (bare and not about_steps) or rows.picture_layout(shape, dtype) is not None
     return rows.sensor_for(rows.OBSERVATION if observed else rows.INFO, arrays.joined(place), shape, dtype)
 
 
