@@ -143,6 +143,7 @@ def killed_while_recording(out: Path) -> None:
         os.kill(process.pid, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_path, capsys, monkeypatch):
     shares = {RECORDING: 60.0, TRAINING: 1.0, SCORING: 60.0}  # recording ends with its frames, training with its steps
     monkeypatch.setattr(LearnSchedule, "share_s", property(lambda schedule: shares))

@@ -68,6 +68,7 @@ def test_a_walk_of_1000_steps_drifts_up_to_the_ceiling_and_invents_no_more_than_
         assert float(shown["drifted"]) == pytest.approx(float((0.15 - invented) * share), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_rollouts_along_a_recording_are_those_of_the_seed(corridor, posed_run):
     world = load_world(posed_run[0] / "world")
     cache = ClipCache.open(Dataset(corridor), (24, 32))
@@ -80,6 +81,7 @@ def test_rollouts_along_a_recording_are_those_of_the_seed(corridor, posed_run):
     assert facts["ceiling"] == pytest.approx(float(world.uncertainty.ceiling), abs=1e-4) and facts["drift_steps"] == 15
 
 
+@pytest.mark.slow
 def test_an_older_world_expects_no_more_than_it_was_calibrated_to(posed_run, tmp_path):
     save_world(load_world(posed_run[0] / "world"), tmp_path / "world")
     path = tmp_path / "world" / "weights.safetensors"

@@ -112,6 +112,7 @@ def test_episodes_at_once_have_their_own_goals_and_do_what_each_would_alone(made
     assert not torch.allclose(together[0], together[1], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_a_search_that_hardly_searches_is_better_for_its_proposals(made):
     world, folder = Told(), made[0]
     cost = distance_to(world, {"observation": torch.tensor([4.0, 4.0])}, "last")

@@ -97,6 +97,7 @@ def test_a_labelled_copy_has_codes_for_actions(recording, run, tmp_path):
     assert set(open_source(tmp_path / "copy").sensors) == set(open_source(recording).sensors)
 
 
+@pytest.mark.slow
 def test_pictures_alone_are_enough(run, tmp_path):
     silent = scrolling(tmp_path / "set", False, episodes=2, length=40)
     assert ClipCache.open(silent, (32, 32)).action is None

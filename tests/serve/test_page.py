@@ -245,7 +245,7 @@ def test_touch_moves_and_turns(serve_world, open_page):
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844), (844, 390)])
+@pytest.mark.parametrize("size", [(1280, 800), pytest.param((390, 844), marks=pytest.mark.slow), (844, 390)])
 def test_it_fits_and_looks_like_something(serve_world, open_page, tmp_path, size):
     pair = [Panorama(size=(96, 128), forkable=False), SlowDream(size=(96, 128))]
     page = open_page(serve_world(pair).url, viewport={"width": size[0], "height": size[1]})

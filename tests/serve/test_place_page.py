@@ -279,6 +279,7 @@ def test_a_large_place_shows_before_all_of_it_is_there(tmp_path, opened, browser
     assert page.evaluate("terrella.story.scene.length") == 4600
 
 
+@pytest.mark.slow
 def test_fewer_gaussians_leave_no_surface_open(tmp_path, opened):
     words = "a small room with a pillar and a window"
     assert main(["space", "build", words, "--out", str(tmp_path / "w"), "--gaussians", "6000"]) == 0

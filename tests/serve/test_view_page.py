@@ -258,7 +258,10 @@ def test_its_arithmetic_is_numpys(open_view):
     np.testing.assert_allclose(found, yaw, atol=1e-9)
 
 
-@pytest.mark.parametrize("size", [(1440, 900), pytest.param((1024, 700), marks=pytest.mark.slow), (390, 844)])
+@pytest.mark.parametrize(
+    "size",
+    [(1440, 900), pytest.param((1024, 700), marks=pytest.mark.slow), pytest.param((390, 844), marks=pytest.mark.slow)],
+)
 def test_it_fits_and_looks_like_something(open_view, tmp_path, size):
     page = open_view(size=size, hash="#episode=1&time=2.5")
     names = ["header", "#tiles", "#deck", "#play", "#mark", "#list", *(f"figure >> nth={at}" for at in range(5))]
