@@ -242,7 +242,7 @@ def test_names_that_no_file_can_have_are_changed_and_named(tmp_path):
         "observation.arm/pos": "observation.arm_pos_2", "/wheel speed": "_wheel_speed",
         "observation.images.front/rgb": "observation.images.front_rgb", ".hidden": "_.hidden",
     }  # fmt: skip
-    assert notes == [f"'{name}' is '{now}' in LeRobot, whose names are file names." for name, now in changed.items()]
+    assert notes == [f"'{name}' is '{now}' in LeRobot, where it names files." for name, now in changed.items()]
     (back,) = Dataset(tmp_path / "out").source().takes()
     for name, values in numbers.items():
         assert np.array_equal(np.asarray(list(back.readings[changed.get(name, name)].values)), values)

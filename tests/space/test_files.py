@@ -179,5 +179,16 @@ def test_the_faces_of_a_mesh_are_left_out_by_name(tmp_path):
     faces = "element face 1\nproperty list uchar int vertex_indices\n"
     head = f"ply\nformat ascii 1.0\nelement vertex 3\n{columns}{faces}end_header\n"
     (tmp_path / "mesh.ply").write_bytes(head.encode() + points + b"3 0 1 2\n")
-    with pytest.warns(UserWarning, match="1 faces are left out"):
+    with pytest.warns(UserWarning, match="left out: 1 face[.]"):
         assert len(read_scene(tmp_path / "mesh.ply")) == 3
+
+
+@pytest.mark.parametrize(
+    "lists", ["property list uchar int tracks\n", "element face 0\nproperty list uchar int corners\n"]
+)
+def test_points_with_lists_are_refused_by_that_reason(tmp_path, lists):
+    points = "element vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    head = points + lists if "tracks" in lists else lists + points
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\n{head}end_header\n0 0 0 0\n")
+    with pytest.raises(DatasetError, match="points hold lists, or come after lists"):
+        read_scene(tmp_path / "a.ply")

@@ -1,4 +1,4 @@
-"""What of an environment is in no channel, as people read it."""
+"""What was left out of an environment or a recording, as text."""
 
 from collections.abc import Mapping
 

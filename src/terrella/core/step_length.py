@@ -66,7 +66,7 @@ def infos_of_step(env: gymnasium.Env) -> list[str]:
 
 
 def _trial(env: gymnasium.Env) -> Any:
-    """An action that does nothing, or a middle one. Of a Dict or Tuple, which no Spec has, any."""
+    """The neutral action; of a Dict or Tuple, which no Spec has, a random one."""
     try:
         return neutral_action(Spec("trial", env.action_space, {}, (), 1.0))[()]
     except TerrellaError:

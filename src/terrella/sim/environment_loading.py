@@ -112,7 +112,7 @@ def _render_modes(env: gymnasium.Env) -> Sequence[str]:
 
 
 def first_picture(env: gymnasium.Env, name: str, pictures: DrawnPictures) -> tuple[tuple[int, int] | None, str]:
-    """((height, width) of the picture of an environment after a reset or None, why there is none)."""
+    """((height, width) of the picture of an environment after a reset or None; why there is none)."""
     if not renders_pictures(env):
         made = f"it was made with render_mode={env.render_mode!r}, not 'rgb_array'"
         return None, made if "rgb_array" in _render_modes(env) else ""

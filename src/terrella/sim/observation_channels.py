@@ -63,7 +63,7 @@ class ObservationParts:
 
     @property
     def renamed(self) -> dict[str, str]:
-        """Entry -> channel, where it is called otherwise."""
+        """Entry -> channel, where their names differ."""
         labels = {label_of(part.path): channel for channel, part in self.arrays.items() if part.path}
         return {label: channel for label, channel in labels.items() if label != channel}
 

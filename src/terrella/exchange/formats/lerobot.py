@@ -93,7 +93,7 @@ def _with_file_names(source: Source) -> tuple[Source, list[str]]:
     names: dict[str, str] = {}
     for name in sorted(source.sensors, key=lambda name: file_name(name) != name):  # good names stay
         names[name] = rows.unique(file_name(name), names.values())
-    notes = [f"'{name}' is '{now}' in LeRobot, where it names a file." for name, now in names.items() if name != now]
+    notes = [f"'{name}' is '{now}' in LeRobot, where it names files." for name, now in names.items() if name != now]
     if not notes:
         return source, []
     sensors = {names[name]: replace(sensor, name=names[name]) for name, sensor in source.sensors.items()}

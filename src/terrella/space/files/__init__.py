@@ -44,9 +44,9 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
             elements = ply.parse(data)
             scene = compressed.decode(elements) if "chunk" in elements else ply.decode(elements)
             if others := ply.other_elements(data):
-                warnings.warn(f"of its points Gaussians are made; {', '.join(others)} are left out.", stacklevel=2)
+                warnings.warn(f"its points become Gaussians; left out: {', '.join(others)}.", stacklevel=2)
             if "chunk" not in elements and (others := ply.other_columns(elements["vertex"])):
-                warnings.warn(f"its columns {', '.join(others)} are left out.", stacklevel=2)
+                warnings.warn(f"left out: its columns {', '.join(others)}.", stacklevel=2)
             usual = "rdf"
         elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
             scene, usual = spz.decode(data), "rub"

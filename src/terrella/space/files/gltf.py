@@ -40,7 +40,7 @@ class Gltf:
         """Entry `index` of a list in the JSON; ValueError where there is none."""
         entries = self.about.get(kind, [])
         if type(index) is not int or not isinstance(entries, list) or not 0 <= index < len(entries):
-            raise ValueError(f"it speaks of number {str(index)[:20]} of its {kind}, which it has not")
+            raise ValueError(f"it uses number {str(index)[:20]} of its {kind}, which it does not have")
         if not isinstance(entries[index], dict):
             raise ValueError(f"number {index} of its {kind} is nothing")
         return entries[index]
@@ -64,7 +64,7 @@ class Gltf:
             some = _whole(sparse, "count")
             where = self._rows(sparse["indices"], some, 1, np.dtype(_TYPES[sparse["indices"]["componentType"]]))[:, 0]
             if where.max() >= count:
-                raise ValueError(f"its sparse accessor {index} changes a row which it has not")
+                raise ValueError(f"its sparse accessor {index} changes a row that it does not have")
             rows[where] = self._rows(sparse["values"], some, width, kind)
         if about.get("normalized") and kind.kind in "iu":
             return np.maximum(rows.astype(np.float32) / np.iinfo(kind).max, -1)
@@ -133,7 +133,7 @@ class Gltf:
     def _buffer(self, view: dict[str, Any]) -> bytes:
         index = view.get("buffer")
         if type(index) is not int or not 0 <= index < len(self.buffers):
-            raise ValueError(f"it speaks of a buffer {index}, which it has not")
+            raise ValueError(f"it uses a buffer {index} that it does not have")
         return self.buffers[index]
 
 

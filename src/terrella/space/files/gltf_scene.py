@@ -168,7 +168,7 @@ def _scene(file: Gltf, nodes: list, parts: list, places: dict[int, np.ndarray]) 
     for node, matrix, part in solid:
         which = part.get("material", -1)
         if type(which) is not int or not -1 <= which < len(abouts):
-            raise ValueError("it speaks of a material which it has not")
+            raise ValueError("it uses a material that it does not have")
         one = _triangles(file, node, matrix, part, base_of(abouts[which] if which >= 0 else {})[1], places)
         if id(node) not in numbers:
             names.append(node["name"] or f"thing {len(names) + 1}")
@@ -222,7 +222,7 @@ def _triangles(
     rows[:, 7:] = transformed_uv(rows[:, 7:], transform_uv)
     index = file.numbers(part["indices"], 1)[:, 0].astype(np.int64) if "indices" in part else np.arange(len(points))
     if len(index) and not 0 <= index.min() <= index.max() < len(points):
-        raise ValueError("a triangle of it has a corner which it has not")
+        raise ValueError("a triangle uses a corner that the file does not have")
     index = index[_CORNERS[part.get("mode", 4)](np.arange(_count(file, part)))]
     corners = rows[index[:, [0, 2, 1]] if np.linalg.det(matrix[:3, :3]) < 0 else index]
     with np.errstate(over="ignore", invalid="ignore"):
@@ -264,7 +264,7 @@ def _skinned(
             break
         which, weights = file.numbers(given[f"JOINTS_{group}"], 4), file.numbers(given[f"WEIGHTS_{group}"], 4)
         if which.max() >= len(joints) or len(which) != len(points):
-            raise ValueError("its skin speaks of a joint which it has not")
+            raise ValueError("its skin uses a joint that it does not have")
         for joint, weight in zip(which.T, weights.T):
             total += weight[:, None] * (joints[joint] @ whole[..., None])[..., 0]
     return total[:, :3] / np.where(total[:, 3:] > 0, total[:, 3:], 1)

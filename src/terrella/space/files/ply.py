@@ -25,13 +25,17 @@ def parse(data: bytes) -> dict[str, np.ndarray]:
     form, tables, body = _header(data)
     plain = takewhile(lambda table: all(kind for _, kind in table[2]), tables)
     kinds = [(name, count, np.dtype(columns)) for name, count, columns in plain]  # ValueError for columns of one name
+    if "vertex" in {name for name, *_ in tables} - {name for name, *_ in kinds}:
+        raise ValueError(
+            "its points hold lists, or come after lists (faces), which are not read: save the points first"
+        )
     return _rows_of_text(data[body:], kinds) if form == "ascii" else _rows(data, body, kinds)
 
 
 def other_elements(data: bytes) -> list[str]:
     """Elements of a PLY beside points and what belongs to Gaussians, such as the faces of a mesh, with their numbers."""
     others = [(name, count) for name, count, _ in _header(data)[1] if name not in ("vertex", "chunk", "sh")]
-    return [f"{count:,} {name}s" for name, count in others if count]
+    return [f"{count:,} {name}{'s' * (count > 1)}" for name, count in others if count]
 
 
 def other_columns(rows: np.ndarray) -> list[str]:

@@ -64,7 +64,7 @@ class Shots:
 
 
 def absent(name: str) -> str:
-    """How a file is named that is listed and not there."""
+    """The name of a listed file that is absent, for people."""
     return f"{name} (absent)"
 
 

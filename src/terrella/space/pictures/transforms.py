@@ -20,7 +20,7 @@ _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OP
 
 
 def file_of(path: Path) -> Path | None:
-    """The list of pictures that a path is, or that lies in it."""
+    """The transforms.json at a path, or in that folder; None where there is none."""
     return next((file for name in FILES if (file := path / name).is_file()), path if path.name in FILES else None)
 
 
@@ -82,7 +82,7 @@ def _lens(frame: dict[str, Any], file: Path, cameras: dict[tuple[Any, ...], Lens
 
 
 def _focal(frame: dict[str, Any], focal: str, angle: str, side: int) -> float:
-    """Pixels, stated, or of the angle of view of a side."""
+    """A focal length in pixels: as stated, or from the angle of view across `side` pixels."""
     return float(frame[focal]) if focal in frame else 0.5 * side / float(np.tan(0.5 * float(frame[angle])))
 
 
