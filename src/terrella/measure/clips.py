@@ -129,9 +129,10 @@ def clips_from_cache(
             offset = int(torch.randint(spare + 1, (1,), generator=rng))
             starts += [(episode, row) for row in range(first + offset, stop - length + 1, length)]
     if not starts:
+        inside = "" if where is None else " and lies in the part of the map that is scored"
         raise DatasetError(
-            f"no window of {length} rows ({context} of context, {horizon} of horizon) fits in these {len(episodes)} "
-            "episodes; record longer episodes or ask for a shorter horizon."
+            f"no window of {length} rows ({context} of context, {horizon} of horizon) fits in an episode{inside}; "
+            "record longer episodes or ask for a shorter horizon."
         )
     order = torch.randperm(len(starts), generator=rng).tolist()[:count]
     return [_cut(cache, starts[pick], length, context) for pick in order]

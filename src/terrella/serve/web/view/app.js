@@ -36,7 +36,7 @@ async function begin() {
   document.title = `${about.name} · Terrella`;
   write('name', about.name);
   const seconds = about.episodes.reduce((sum, each) => sum + each.seconds, 0);
-  write('what', [about.robot, `${(seconds / 60).toFixed(seconds < 600 ? 1 : 0)} minutes`, count(about.sensors.length, 'sensor')].filter(Boolean).join(' · '));
+  write('what', [about.robot, seconds < 60 ? `${seconds.toFixed(1)} seconds` : `${(seconds / 60).toFixed(seconds < 600 ? 1 : 0)} minutes`, count(about.sensors.length, 'sensor')].filter(Boolean).join(' · '));
   $('export').hidden = !about.can_export || !about.export_to;
   drawFacts();
   drawMarks();
@@ -229,6 +229,7 @@ function neighbour(by) {
 function drawMarks() {
   const good = about.episodes.length - bad.size, now = !!episode && bad.has(episode.number);
   write('count', about.episodes.length.toLocaleString('en'));
+  write('count-word', about.episodes.length === 1 ? 'episode' : 'episodes');
   write('bad-count', bad.size.toLocaleString('en'));
   $('mark').setAttribute('aria-pressed', now);
   write('mark-words', now ? 'Marked bad' : 'Mark bad');

@@ -109,7 +109,7 @@ export class Tracks {
     lane.update();
     legend.append(...lane.cells.map(({ button }) => button));
     lane.label.append(legend);
-    const lines = Math.min(6, Math.ceil(names.length / (names.length < 3 ? 1 : 2)));
+    const narrow = matchMedia('(max-width: 700px)').matches, lines = Math.min(narrow ? 4 : 6, Math.ceil(names.length / (names.length < 3 || narrow ? 1 : 2)));
     lane.element.style.height = `${Math.max(sensor.dtype === 'bool' ? 40 : 56, 26 + 16 * lines)}px`;
     if (sensor.names.length > MOST_COLUMNS) lane.head.title += ` · the first ${MOST_COLUMNS} of ${sensor.names.length} numbers`;
   }
