@@ -80,7 +80,7 @@ LOOKS = ["KHR_materials_transmission", "KHR_materials_variants"]
 ODD = {
     # kind: (how it is made, the figure of what came out, its number, words for each thing that is left out)
     "Gaussians that are no numbers": (lost_gaussians, "gaussians", 17, ["3 of its 20 Gaussians"]),
-    "a mesh": (mesh_as_ply, "gaussians", 20, ["2 faces, 1 edges"]),
+    "a mesh": (mesh_as_ply, "gaussians", 20, ["2 faces, 1 edge"]),
     "harmonics of degree 4": (harmonics_of_degree_4, "gaussians", 20, ["degree 4"]),
     "Gaussians beside a mesh": (gaussians_beside_a_mesh, "gaussians", 20, ["EXT_lights_ies, 1 meshes"]),
     "points and lines": (gltf(points_and_lines), "triangles", 2, ["3 meshes of points or lines"]),
