@@ -186,6 +186,14 @@ def test_folders_of_pictures_may_have_other_cameras(tmp_path):
     assert any("images.side" in note for note in notes) and any("images.front" in note for note in notes)
 
 
+@pytest.mark.parametrize("to", ["videos", "images"])
+def test_an_episode_without_pictures_makes_no_film_and_is_named(tmp_path, to):
+    npz(tmp_path / "a", "actions grip", "actions front")
+    notes = write_source(open_source(tmp_path / "a", fps=10), tmp_path / "b", to)
+    assert len(list(open_source(tmp_path / "b").takes())) == 1
+    assert sum(f"'{RGB}' has no readings in 1 of 2 takes (0)" in note for note in notes) == 1
+
+
 def test_numbers_of_another_type_are_not_cut_short(tmp_path):
     (tmp_path / "a").mkdir()
     for number, values in enumerate((np.array([1, 2, 3]), np.array([0.5, 1.5, 2.5]))):

@@ -81,11 +81,15 @@ def clean(camera: str) -> str:
 
 
 def numbered(source: Source, cameras: Mapping[str, str], progress) -> Iterator[tuple[int, Take]]:
-    """Takes reduced to their pictures, with checked clocks; DatasetError for a take without pictures."""
+    """Takes reduced to their pictures, with checked clocks, without those that have none; DatasetError where no take has any."""
+    empty = True
     for number, take in rows.numbered(source, progress):
         shown = [name for name in cameras if name in take.readings and len(take.readings[name].values)]
         if not shown:
-            raise DatasetError(f"take {number} has no pictures; leave it out.")
+            continue  # `write_source` names what a take lacks
+        empty = False
         for name in shown:
             clock_of(take.readings[name], f"'{name}' in take {number}")
         yield number, Take({name: take.readings[name] for name in shown}, take.task)
+    if empty:
+        raise DatasetError(f"no take of {source.name or 'the source'} has pictures; write it in another format.")
