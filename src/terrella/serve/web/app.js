@@ -344,7 +344,7 @@ function fullscreen() {
 
 addEventListener('keydown', (event) => {
   if (event.target.tagName === 'INPUT' || event.ctrlKey || event.metaKey || event.altKey) return;
-  const button = event.target.closest?.('button') && (event.code === 'Enter' || event.code === 'Space');
+  const button = event.target.closest?.('a, button, summary') && (event.code === 'Enter' || event.code === 'Space');
   if (event.target === $('timeline') && past.key(event.code)) return event.preventDefault();
   if (controls.press(event.code, event.timeStamp)) event.preventDefault();
   else if (event.code === 'Backspace') { event.preventDefault(); if (!event.repeat) past.startRewind(); }
