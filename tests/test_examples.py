@@ -59,6 +59,7 @@ def test_controllers_of_ones_own():
     assert steps["balance"] > steps["lean"] and steps["balance"] > steps["random"]
 
 
+@pytest.mark.slow
 def test_a_robot_with_two_cameras_is_recorded(tmp_path):
     """In a process of its own: a renderer without a display fails in ways that outlive a test."""
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'terrella[mujoco]'")

@@ -410,6 +410,7 @@ def test_record_then_look(capsys, tmp_path):
     json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_whole_episodes_of_a_policy_are_recorded_by_workers_and_again(capsys, tmp_path):
     folder, common = (
         tmp_path / "set",

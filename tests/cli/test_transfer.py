@@ -190,7 +190,7 @@ def test_a_recording_stands_for_reality(tmp_path, capsys, few):
     assert told["action_error"]["simulator"]["value"] < 0.5 * told["action_error"]["random"]["value"]
     for ignored in (("--dial", "0.5"), ("--arms", "nominal"), ("--camera",)):
         code, _, err = ran(capsys, *words, *ignored)
-        assert code == 2 and "leave them out" in err
+        assert code == 2 and "leave that out" in err
     record(
         load("mujoco:arm", cameras=()),
         Random(real.spec, (1, 9)),

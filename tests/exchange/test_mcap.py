@@ -447,7 +447,7 @@ def _small(path, count=40, **options):
     return stranger.finish()
 
 
-@pytest.mark.parametrize("options", [{}, {"use_chunking": False}])
+@pytest.mark.parametrize("options", [{}, pytest.param({"use_chunking": False}, marks=pytest.mark.slow)])
 def test_a_file_cut_at_any_byte_is_read_up_to_there(tmp_path, options):
     whole = _small(tmp_path / "whole.mcap", 16, **options).read_bytes()
     cut = tmp_path / "cut.mcap"

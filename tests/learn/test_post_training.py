@@ -102,7 +102,7 @@ def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(c
 
 
 @pytest.mark.parametrize("kind, data, seed", [("teacher", "corridor", 0), ("places", "corridor", 0),
-                                              ("places", "corridor", 1),
+                                              pytest.param("places", "corridor", 1, marks=pytest.mark.slow),
                                               pytest.param("moving", "haunted", 0, marks=pytest.mark.slow)])  # fmt: skip
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
     world = tame(request.getfixturevalue(kind))
@@ -130,6 +130,7 @@ def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, reque
         assert torch.equal(batch.truth[:, :3], truth)
 
 
+@pytest.mark.slow
 def test_a_teacher_may_watch_the_dreams(corridor, teacher, student, places, tmp_path):
     train_dreams(student, corridor, tmp_path / "watched", DREAMS, quiet, teacher)
     train_dreams(student, corridor, tmp_path / "alone", DREAMS, quiet)

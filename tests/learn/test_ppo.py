@@ -127,6 +127,7 @@ def test_ranges_grow_while_the_policy_copes_and_wait_where_it_does_not():
     assert float(growth.scale) == stopped
 
 
+@pytest.mark.slow
 def test_a_run_with_growing_ranges_goes_on_exactly(tmp_path):
     class Scaled(Hold):
         scale = 1.0

@@ -110,6 +110,7 @@ def test_the_world_of_the_run_is_opened_by_name_and_keeps_the_contract(run):
     assert world.spec.card["validation"] == json.loads((run[0] / "validation.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_few_numbers_are_the_latent_themselves(vectors, tmp_path):
     """No encoder, no collapse to prevent: what is decoded is what was predicted."""
     facts = train_latent(vectors, tmp_path, replace(QUICK, latent=None), quiet)

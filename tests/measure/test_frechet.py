@@ -252,6 +252,7 @@ def test_the_scorecard_praises_the_perfect_world_and_finds_out_the_fading_one(ca
     assert all(row.baselines["blurred by 1 pixel"].value > 0 for row in looks(card, "perfect"))
 
 
+@pytest.mark.slow
 def test_the_page_and_the_json_tell_it(card):
     html = page(card, "t", PROBES)
     assert "Frechet distance" in html and "blurred by 1 pixel" in html

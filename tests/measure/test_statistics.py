@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from terrella.core import make_rng
-from terrella.measure.statistics import Figure, mean_band, mean_interval, median_interval, ratio_interval, wilson
+from terrella.measure.statistics import (
+    Figure,
+    interval_of,
+    mean_band,
+    mean_interval,
+    median_interval,
+    ratio_interval,
+    wilson,
+)
 
 
 def test_interval_of_a_normal_sample_is_close_to_the_textbook():
@@ -65,3 +73,12 @@ def test_wilsons_interval_is_that_of_the_textbook():
 def test_figures_are_read_without_exponents():
     assert str(Figure(-1074.2, -1410.0, -0.798, 4)) == "-1,074 [-1,410, -0.798] (n=4)"
     assert str(Figure(999.7, 12.345, 1e5, 9)) == "1,000 [12.3, 100,000] (n=9)"
+
+
+def test_an_interval_of_draws_is_their_quantiles():
+    draws = torch.rand(1000, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    ends = torch.tensor([0.025, 0.975], dtype=torch.float64)
+    assert torch.allclose(torch.stack(interval_of(draws)), draws.quantile(ends, dim=0), rtol=0, atol=1e-12)
+    draws[:300, 2] = math.nan
+    low, high = interval_of(draws)
+    assert torch.equal(torch.stack([low, high])[:, 2], draws[300:, 2].quantile(ends))

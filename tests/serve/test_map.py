@@ -166,7 +166,7 @@ def test_a_world_that_fails_to_tell_what_it_remembers_plays_on(serve_world, open
     assert "it forgot" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("size", [(390, 844), (844, 390)])
+@pytest.mark.parametrize("size", [(390, 844), pytest.param((844, 390), marks=pytest.mark.slow)])
 def test_on_a_phone_it_is_closed_at_first_and_fits_when_opened(serve_world, open_page, size):  # noqa: F811
     phone = {"viewport": {"width": size[0], "height": size[1]}, "has_touch": True, "is_mobile": True}
     page = open_page(serve_world([Mapped(size=(96, 128))]).url, **phone)

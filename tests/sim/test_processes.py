@@ -121,7 +121,7 @@ def test_a_crash_and_a_fault_are_one_sentence_and_a_reset_goes_on(world):
     env.step(np.array([0, 1]))
 
 
-@pytest.mark.parametrize("how", ["close", "forget"])
+@pytest.mark.parametrize("how", ["close", pytest.param("forget", marks=pytest.mark.slow)])
 def test_processes_end_with_their_world(how):
     world = GymnasiumWorld(walker)
     seen = world.render(world.start(2, make_rng(0)), ("observation",))["observation"]

@@ -48,6 +48,7 @@ def test_identification_finds_what_differs(pair):
     assert 0.6 <= low < 0.8 < high <= 1.2
 
 
+@pytest.mark.slow
 def test_a_residual_of_few_episodes_puts_others_right(pair, tmp_path):
     from terrella.sim.corrected import residual_targets
     from terrella.workflows.transfer_arms import fit_residual

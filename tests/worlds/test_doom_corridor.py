@@ -43,6 +43,7 @@ def test_the_guards_that_stories_begin_with_are_billboards_and_nothing_else(worl
     assert things.any() and (things & (state["instances"] == 0)).float().mean() < 0.001
 
 
+@pytest.mark.slow
 def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
     """Dreams of two seconds before each guard of the entrance: looking straight at it or 0.38 rad beside, with ATTACK held or
     not."""

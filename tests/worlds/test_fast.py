@@ -189,6 +189,7 @@ def test_cuda_graphs_draw_the_same():
         np.testing.assert_allclose(one["rgb"].int(), other["rgb"].int(), atol=2)
 
 
+@pytest.mark.slow
 def test_several_flow_steps_go_through_it_too(worlds):
     eager, quick = worlds
     noisy, _, conditioning = example_inputs(eager)

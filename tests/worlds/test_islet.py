@@ -36,7 +36,14 @@ def test_it_is_a_world_of_pictures_and_says_how_it_is_played(world):
     )
 
 
-@pytest.mark.parametrize("action, way", [("right", (-2, 0)), ("left", (2, 0)), ("down", (0, -2)), ("up", (0, 2))])
+@pytest.mark.parametrize(
+    "action, way",
+    [
+        ("right", (-2, 0)),
+        ("down", (0, -2)),
+        *(pytest.param(*other, marks=pytest.mark.slow) for other in (("left", (2, 0)), ("up", (0, 2)))),
+    ],
+)
 def test_the_picture_scrolls_as_it_is_told(world, action, way):
     """More often than in any other way; at the border of the island, and against trees, it stands."""
     moves, seen = world.scene.moves, walked(world, action, 10)

@@ -194,7 +194,9 @@ def test_a_batch_of_many_is_one_pass_of_the_network(monkeypatch):
     assert sum(calls) == 8 and len(calls) <= 2
 
 
-@pytest.mark.parametrize("more", [{}, {"moving": True, "objects": True}], ids=["still", "things"])
+@pytest.mark.parametrize(
+    "more", [{}, pytest.param({"moving": True, "objects": True}, marks=pytest.mark.slow)], ids=["still", "things"]
+)
 def test_a_whole_step_stays_on_the_worlds_device(more):
     """`meta` stands for any second device: what it gives to the CPU, or mixes with tensors of the CPU, is an error."""
     world = place(KINDS["axes"], **more).replaced(uncertainty=UncertaintyNetwork(UncertaintyConfig())).to("meta")

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from .agreement import LEAST, Agreement, agreement, halves, spearman
-from .statistics import RESAMPLES, Band, Figure, mean_interval, wilson
+from .statistics import RESAMPLES, Band, Figure, interval_of, mean_interval, wilson
 
 REAL, DREAM, CONTROL = "real", "dream", "control"
 RETURN, SUCCESS = "return", "success"
@@ -110,7 +110,7 @@ def _mean_curves(open_loop: Mapping[str, Mapping[str, Sequence[float]]], rng: to
         ones = torch.ones(RESAMPLES, count, dtype=torch.float64)
         weights = torch.zeros_like(ones).scatter_add_(1, torch.randint(count, (RESAMPLES, count), generator=rng), ones)
         drawn = (weights @ values) / (weights @ known)
-        low, high = drawn.nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+        low, high = interval_of(drawn)
         nothing = [math.nan] * enough
         centre = (values.sum(0) / known.sum(0)).tolist()
         bands[channel] = Band(centre, *((low.tolist(), high.tolist()) if count > 1 else (nothing, nothing)), count)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 RESAMPLES = 2000
@@ -127,8 +128,19 @@ def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Gener
     if count < 2:
         nothing = [math.nan] * len(centre)
         return Band(centre.tolist() if count else nothing, nothing, nothing, count)
-    low, high = resample(_weights(count, rng)).nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64), dim=0)
+    low, high = interval_of(resample(_weights(count, rng)))
     return Band(centre.tolist(), low.tolist(), high.tolist(), count)
+
+
+def interval_of(draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The 2.5% and 97.5% quantiles of draws [n, T], each [T]; nan is left out."""
+    if not draws.isfinite().all():
+        low, high = draws.nanquantile(torch.tensor([0.025, 0.975], dtype=draws.dtype), dim=0)
+        return low, high
+    ends = [share * (len(draws) - 1) for share in (0.025, 0.975)]  # selection takes a fifth of a sort's time
+    near = np.partition(draws.numpy(), sorted({int(end) + more for end in ends for more in (0, 1)}), axis=0)
+    low, high = (torch.from_numpy(near[int(end)] + (end % 1) * (near[int(end) + 1] - near[int(end)])) for end in ends)
+    return low, high
 
 
 def _weights(count: int, rng: torch.Generator) -> torch.Tensor:
