@@ -5,24 +5,29 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import tempfile
 import threading
 import urllib.error
 import urllib.request
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from PIL import Image
 
 from terrella.core.errors import TerrellaError
+from terrella.exchange.browse import Browse
 from terrella.serve import ServeConfig
 from terrella.serve.http_server import make_server, open_port
 from terrella.serve.server import Sessions, build_app
 from terrella.serve.start_page import StartCard, StartPage
+from terrella.serve.viewer import build_viewer
 from terrella.workflows.opening import ControlsConfig
 from terrella.workflows.play import PlayConfig, first_seed
 from terrella.workflows.progress import silent
 from terrella.workflows.start import FolderShelf
 
+from . import rig
 from .panorama import Panorama
 from .test_page import open_page, until  # noqa: F401  (a fixture)
 
@@ -32,9 +37,13 @@ class Drawer:
 
     def __init__(self):
         self.built: list[str] = []
+        self.marks = Path(tempfile.mkdtemp()) / "marks.json"
 
     def cards(self):
-        return [StartCard(name, name.title(), "bundled", "A view.") for name in ("hills", "broken", *self.built)]
+        return [
+            StartCard(name, name.title(), "bundled", "A view.")
+            for name in ("hills", "broken", "a recording", *self.built)
+        ]
 
     def thumbnail(self, name):
         data = io.BytesIO()
@@ -44,6 +53,8 @@ class Drawer:
     def open(self, name):
         if name == "broken":
             raise TerrellaError("broken cannot be opened; choose another.")
+        if name == "a recording":
+            return lambda host, token: build_viewer(Browse(rig.lively(1), self.marks), host, token)
         sessions = Sessions([Panorama()], ServeConfig(home=True))
         return lambda host, token: build_app(sessions, host, token)
 
@@ -89,6 +100,7 @@ def test_what_is_opened_is_at_the_same_address_and_the_start_page_stays():
         ] == [
             "hills",
             "broken",
+            "a recording",
         ]
         assert http.get("/start/thumbnail?name=hills").headers["content-type"] == "image/jpeg"
         assert http.get("/start/thumbnail?name=../secret").status == 404
@@ -128,6 +140,9 @@ def test_a_click_opens_a_world_and_its_mark_leads_back(browser):
         until(page, "!!window.terrella && terrella.painted > 2")
         page.press("#brand", "Enter")
         page.wait_for_selector(".card")
+        page.click("text=A Recording")
+        page.wait_for_selector(".episode")
+        page.press(".brand", "Enter")
         page.fill("#describe", "a hall")
         page.press("#describe", "Enter")
         page.wait_for_selector("#timeline")

@@ -9,7 +9,7 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
-import { reach } from './reach.js';
+import { linkBack, reach } from './reach.js';
 import { Remote } from './remote.js';
 import { decoded, inflate, joined, Reader, unpackScene } from './scene.js';
 import { Solid } from './solid.js';
@@ -225,6 +225,7 @@ function run({ drawing, source, story, solid: first }) {
   seen.stands = world.count / source.length;
   take(story.scene);
   greet();
+  linkBack();
   if (world.note && !world.edits.length) toast(`${world.note}.`);
   if (seen.stands > 1 && !world.watch) {  // who watches is given the newest whole
     $('edit').hidden = true;

@@ -1,4 +1,4 @@
-// Asks the server; where it is gone, the error says so, and which command starts it again.
+// Asks the server; where it is gone, the error says so, and which command starts it again. And the way back to the start page.
 
 export async function reach(address, command, options) {
   const answer = await fetch(address, options).catch(() => {
@@ -6,4 +6,10 @@ export async function reach(address, command, options) {
   });
   if (!answer.ok) throw new Error(await answer.text());
   return answer;
+}
+
+/** Makes the mark a link to the start page, where the page was opened from one. */
+export function linkBack() {
+  const start = location.protocol === 'file:' ? null : sessionStorage.getItem('terrella-start');
+  if (start) document.querySelector('.brand').href = start;
 }

@@ -1,5 +1,6 @@
 // The page of a recording: opens episodes, plays them with all sensors in step, and marks the bad ones.
 
+import { linkBack } from '../place/reach.js';
 import * as library from './library.js';
 import { Tiles } from './tiles.js';
 import { Tracks, clock } from './tracks.js';
@@ -370,4 +371,5 @@ window.viewer = Object.freeze({
   get listed() { return [...filtered]; },
 });
 
+linkBack();
 begin().then(() => requestAnimationFrame(tick));

@@ -1,6 +1,6 @@
 // The page's colours: lines of a plot, and ramps for depth and height.
 
-export const INK = '#eceae4', MUTE = '#8d9097', FAINT = '#5b5f67', LINE = '#24272d', AURORA = '#7fe3c4', AMBER = '#f0c274', EMBER = '#ff6b5e';
+export const MUTE = '#8d9097', FAINT = '#5b5f67', LINE = '#24272d', AURORA = '#7fe3c4', AMBER = '#f0c274', EMBER = '#ff6b5e';
 const LINES = ['#7fe3c4', '#f0c274', '#7fb2f0', '#f08fa6', '#b69cf0', '#b9dd7a', '#f2a274', '#74d3e8'];
 
 export const lineColour = (place) => LINES[place % LINES.length];
