@@ -40,7 +40,8 @@ export class MemoryMap {
   }
 
   tell(known, imagined) {
-    const text = known === null ? '' : `${Math.round(100 * known)}% from memory${imagined > 0.05 ? `, ${Math.round(100 * imagined)}% imagined before` : ''}`;
+    const source = this.keys.length && this.keys.every(({ kind }) => kind === 4) ? 'of the picture was observed' : 'from memory';  // a place has no views, only ground to walk on
+    const text = known === null ? '' : `${Math.round(100 * known)}% ${source}${imagined > 0.05 ? `, ${Math.round(100 * imagined)}% imagined before` : ''}`;
     const node = document.getElementById('map-known');
     if (node.textContent !== text) node.textContent = text;
   }
