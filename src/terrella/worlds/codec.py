@@ -261,8 +261,10 @@ def without_smears(drawn: torch.Tensor, seen: CodecInputs) -> torch.Tensor:
     smaller, so it is a smear."""
     ground = seen.sources[:, -1]
     other = ((drawn.int() - ground.int()).abs().amax(1, keepdim=True) > SAME) & seen.known
-    smears = F.avg_pool2d(other.float(), THING, 1, THING // 2, count_include_pad=False) > 0.5
-    smears = F.max_pool2d(smears.float(), THING, 1, THING // 2) > 0
+    (down, across), (above, before) = ((THING, 1), (1, THING)), ((THING // 2, 0), (0, THING // 2))
+    votes = F.avg_pool2d(2.0 * other - 1, down, 1, above, divisor_override=1)  # sums of +1 and -1, exact
+    smears = F.avg_pool2d(votes, across, 1, before, divisor_override=1) > 0
+    smears = F.max_pool2d(F.max_pool2d(smears.float(), down, 1, above), across, 1, before) > 0
     return torch.where(other & smears, ground, drawn)
 
 
