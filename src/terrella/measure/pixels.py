@@ -111,7 +111,10 @@ def _smaller(frames: torch.Tensor) -> torch.Tensor:
 
 
 def _film(exam: Exam, place: str, clips: Sequence[Clip], name: str, dreams: torch.Tensor) -> DreamFilm | None:
-    """Of the predicted `dreams` [B, T, H, W, 3] of the first clips, the one in which most happens; None without any."""
+    """Of the predicted `dreams` [B, T, H, W, 3] of the first clips, the one in which most happens; None without any, and of
+    single frames."""
+    if not len(dreams) or dreams.shape[1] < 2:
+        return None
     films = []
     for clip, dream in zip(clips, dreams):
         rows = range(clip.context, clip.context + len(dream))
@@ -119,8 +122,6 @@ def _film(exam: Exam, place: str, clips: Sequence[Clip], name: str, dreams: torc
         films.append(
             (float(np.abs(np.diff(truth.astype(np.float32), axis=0)).mean()), len(films), truth, dream.numpy())
         )
-    if not films or len(films[0][2]) < 2:
-        return None
     _, number, truth, dream = max(films, key=lambda film: film[0])
     return DreamFilm(f"{place_label(place)}, clip {number + 1}", truth, dream, exam.dt_s)
 
