@@ -187,6 +187,7 @@ FAULTS = {
 
 def test_a_sound_recording_has_no_fault(recording):
     assert doctor(recording) == []
+    (recording / "look.jpg").touch()  # a picture of it that `record` writes
     assert examine(recording).notes == ["observation.state: z_m, qx, qy never change in 100 rows"]
 
 

@@ -186,7 +186,7 @@ def _unexamined(folder: Survey, rows: RowFacts) -> Iterator[str]:
     """Notes on files and columns that are no part of the dataset."""
     known = {*folder.data, *folder.films}
     files = [path.relative_to(folder.root).as_posix() for path in sorted(folder.root.rglob("*")) if path.is_file()]
-    plain = ("meta/", "streams/", ".", "README", "LICENSE")
+    plain = ("meta/", "streams/", ".", "README", "LICENSE", "look.jpg")  # the last is the picture of `terrella record`
     strange = [file for file in files if file not in known and not file.startswith(plain)]
     if strange:
         yield f"files that are no part of the dataset were not examined: {some_of(strange)}"
