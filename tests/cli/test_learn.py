@@ -24,7 +24,7 @@ from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
 from terrella.workflows.learn import LearnConfig, held_to_real_time
 from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
-from terrella.workflows.learn_trial import Pace, forecast, time_environment
+from terrella.workflows.learn_trial import Pace, forecast, slower, time_environment
 from terrella.workflows.opening import EnvironmentConfig
 from terrella.workflows.results import changed_settings
 from terrella.workflows.results import command as command_line
@@ -230,6 +230,11 @@ def test_what_the_minutes_give_is_said_before_they_are_spent(tmp_path, capsys, m
 def test_the_trial_times_a_recording_and_training_steps():
     pace = time_environment(EnvironmentConfig().open(NAME), 0)
     assert pace.frames_per_s > 1 and 0 < pace.training.step_s < 60 and 0.3 < pace.training.share < 0.9
+
+
+def test_a_pace_that_is_slower_than_the_trial_is_said_as_training_begins():
+    assert slower(600, 5) is None and "which is little" in (slower(599, 5) or "")
+    assert "about 66 steps, too few to learn anything" in (said := slower(66, 5) or "") and "--minutes 46 " in said
 
 
 def test_a_slow_game_is_recorded_for_longer_which_is_said(tmp_path, capsys, monkeypatch):

@@ -44,7 +44,8 @@ def test_rounds_of_practice_go_on_where_they_were_stopped(tmp_path, capsys, monk
 
     hours = {}
 
-    def learned(data, out, config, report):
+    def learned(data, out, config, report, paced):
+        paced(66)
         hours[out.name] = config.hours
         return learn(data, out, replace(config, **small), report)
 
@@ -59,6 +60,8 @@ def test_rounds_of_practice_go_on_where_they_were_stopped(tmp_path, capsys, monk
     monkeypatch.setattr(practising, "train_latent", learned)
     monkeypatch.setattr(practising, "train_policy", stopped)
     assert main(asked) == 130
+    said = capsys.readouterr().err
+    assert "2 rounds of about 150 frames" in said and "66 steps, too few to learn anything" in said
     rows = Dataset(tmp_path / "learned" / "recording").length
     monkeypatch.setattr(practising, "train_policy", practised)
     capsys.readouterr()
@@ -88,16 +91,26 @@ def test_nothing_is_collected_while_the_world_of_what_was_is_learned(tmp_path, m
     for name, value in {"ROUNDS": 1, "FEWEST_FRAMES": 100, "SHARES": {**practising.SHARES, "collecting": 0.0}}.items():
         monkeypatch.setattr(practising, name, value)
 
-    def stopped(data, out, config, report):
+    def stopped(data, out, config, report, paced):
         out.mkdir(exist_ok=True)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(practising, "train_latent", stopped)
+    monkeypatch.setattr(practising, "_forecast", lambda *_: "")
     asked = ["learn", "gym:CartPole-v1", "--practise", "--frames", "300", "--out", str(tmp_path / "learned")]
     assert main(asked) == 130
     collected = Dataset(tmp_path / "learned" / "recording").length
     assert main(asked) == 130
     assert 150 <= collected == Dataset(tmp_path / "learned" / "recording").length < 300
+
+
+def test_minutes_in_which_nothing_is_learned_are_refused_and_leave_nothing(tmp_path, capsys, monkeypatch) -> None:
+    trial = {"frames": 160, "collected_s": 1.0, "world_steps": 30, "steps": 4}
+    monkeypatch.setattr(practising, "_round", lambda *_: trial)
+    out = tmp_path / "out"
+    assert main(["learn", "gym:CartPole-v1", "--practise", "--minutes", "2", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "75 training steps of the world" in said and "Give --minutes 16." in said and not out.exists()
 
 
 def test_the_policy_that_earned_most_is_gone_on_from() -> None:

@@ -230,10 +230,16 @@ def test_figures_of_latents_whose_answers_are_known():
     rng = terrella.make_rng(0)
     latents = torch.randn(2000, 6, generator=rng)
     assert effective_rank(latents) > 5.9 and effective_rank(latents[:, :2] @ torch.randn(2, 6, generator=rng)) < 2.01
+    assert effective_rank(latents[:, :1]) == pytest.approx(1)
     told = latents @ torch.randn(6, 2, generator=rng)
     assert linear_probe(latents[:1000], told[:1000], latents[1000:], told[1000:]) > 0.99
     noise = torch.randn(2000, 2, generator=rng)
     assert linear_probe(latents[:1000], noise[:1000], latents[1000:], noise[1000:]) < 0.1
+
+
+def test_fewer_clips_than_a_batch_are_one_batch(tmp_path):
+    few = drifting(tmp_path / "few", episodes=9, length=12)
+    assert train_latent(few, tmp_path / "run", replace(QUICK, steps=2, batch=128), quiet)["step"] == 2
 
 
 def test_it_learns_the_vectors_that_are_asked_for(tmp_path):

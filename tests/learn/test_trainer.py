@@ -6,6 +6,7 @@ import json
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -198,6 +199,27 @@ def test_a_stage_without_a_share_ends_with_the_hours(tmp_path, monkeypatch):
     assert trainer.limit_s == pytest.approx(0.5)
     trainer.train()
     assert trainer.finished and lines == sorted(lines) and 0 < lines[0] < 1 == lines[-1]
+
+
+def test_the_steps_that_there_will_be_are_said_once_as_soon_as_the_pace_is_known(tmp_path, monkeypatch):
+    now, said = 0.0, list[int]()
+
+    def passes(seconds: float) -> None:
+        nonlocal now
+        now += seconds
+
+    class Slow(Toy):
+        def losses(self, batch, now):
+            passes(4.0)
+            yield from super().losses(batch, now)
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
+    trainer_in(tmp_path / "a", 10**9, Slow(), hours=60 / 3600).train(paced=said.append)
+    assert said == [15], "after 32 s of 60"
+    trainer_in(tmp_path / "b", 12, Slow(), hours=60 / 3600).train(paced=said.append)
+    assert said == [15, 12], "never more than were asked for"
+    trainer_in(tmp_path / "c", 10**9, Slow(), strip_every_s=5.0, hours=60 / 3600).train(lambda: passes(2), said.append)
+    assert said == [15, 12, 12], "pictures take their time, too"
 
 
 def test_a_stage_takes_at_most_its_share(tmp_path):

@@ -176,7 +176,7 @@ def linear_probe(
 
 def effective_rank(latents: torch.Tensor) -> float:
     """Effective rank of latents [n, D]: exp of the entropy of their normalised covariance spectrum (Roy & Vetterli 2007)."""
-    shares = torch.linalg.eigvalsh(torch.cov(latents.double().cpu().T)).clamp_min(0)
+    shares = torch.linalg.eigvalsh(torch.atleast_2d(torch.cov(latents.double().cpu().T))).clamp_min(0)
     shares = shares / shares.sum().clamp_min(1e-12)
     return float(torch.special.entr(shares).sum().exp())
 

@@ -30,7 +30,9 @@ from .budget import Budget
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 
 Report = Callable[[float, float, str], None]
+Paced = Callable[[int], None]
 LOG_EVERY = 20  # steps
+PACE_S = 30.0  # of training after which its pace is known, or sooner: after the first picture
 BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 CPU = torch.device("cpu")
 Module = TypeVar("Module", bound=nn.Module)
@@ -245,17 +247,18 @@ class Trainer:
         by_time = self.facts["seconds"] / self.limit_s if self.limit_s > 0 else 1.0
         return max(self.facts["step"] / self.batches if self.batches > 0 else 1.0, by_time)
 
-    def train(self, draw: Callable[[], object] | None = None) -> None:
-        """Trains to the end; calls `draw()` every strip_every_s seconds, which leaves pictures to look at."""
+    def train(self, draw: Callable[[], object] | None = None, paced: Paced | None = None) -> None:
+        """Trains to the end; calls `draw()` every strip_every_s seconds, which leaves pictures to look at, and once, as soon as the
+        pace is known, `paced(steps)` with the steps that there will be at it, earlier runs included."""
         if self.finished:
             return
         for learner in self.objective.learners.values():
             for module in learner.modules:
                 module.train()
         with _stoppable() as stop:
-            self._train(draw, stop)
+            self._train(draw, stop, paced)
 
-    def _train(self, draw: Callable[[], object] | None, stop: threading.Event) -> None:
+    def _train(self, draw: Callable[[], object] | None, stop: threading.Event, paced: Paced | None) -> None:
         facts, run = self.facts, self.run
         began = saved = drawn = time.monotonic()
         before, first = facts["seconds"], self.steps_done
@@ -273,6 +276,11 @@ class Trainer:
             if draw is not None and now - drawn > run.strip_every_s:
                 draw()
                 drawn = time.monotonic()
+            if paced is not None and (drawn > began or now - began > PACE_S):
+                spent_s = time.monotonic() - began
+                at_pace = (self.limit_s - before) * (self.steps_done - first) / spent_s
+                paced(min(self.batches * self.strides, first + int(at_pace)))
+                paced = None
         self.save()
         if stop.is_set():
             done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"

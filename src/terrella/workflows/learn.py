@@ -17,7 +17,7 @@ from ..learn.trainer import yield_cores
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
-from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, time_environment
+from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
 from .opening import ControlsConfig, EnvironmentConfig
 from .progress import Progress, Report, duration, silent, stage
 from .recording_facts import describe, recording_facts
@@ -172,12 +172,8 @@ class _Learning:
     def _foresee(self, world: World) -> None:
         """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
         schedule = self.schedule
-        posed = (
-            "pose" in world.spec.channels
-        )  # preparing such a world, with memory and motion, takes longer than a trial may
-        if not posed:
-            self.progress("A trial of some seconds: what does this machine manage?")
-        pace = None if posed else time_environment(world, self.config.seed)
+        self.progress("A trial of some seconds: what does this machine manage?")
+        pace = time_environment(world, self.config.seed)
         if pace is None:
             return
         recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
@@ -238,8 +234,12 @@ class _Learning:
         hours = self.schedule.share_s[TRAINING] / 3600
         config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
         config = replace(config, strip_every_s=self._strip_s)
-        facts = train_video(folder / RECORDING, folder / "run", config, report)
+        facts = train_video(folder / RECORDING, folder / "run", config, report, self._paced)
         return {"world": facts["world"], "steps": facts["step"]}
+
+    def _paced(self, steps: int) -> None:
+        if line := slower(steps, self.schedule.minutes):
+            self.progress(line)
 
     def _score(self, report: Report) -> dict[str, object]:
         schedule = self.schedule

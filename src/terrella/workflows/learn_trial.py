@@ -56,6 +56,17 @@ def time_environment(world: World, seed: int) -> Pace | None:
             return None
 
 
+def slower(steps: int, minutes: float) -> str | None:
+    """What to say once training has begun and its pace allows `steps` steps in `minutes` minutes; None where that is enough."""
+    if steps >= FEW_STEPS:
+        return None
+    what = "too few to learn anything" if steps < HOPELESS_STEPS else "which is little"
+    return (
+        f"At the pace of its first steps training will have about {steps:,} steps, {what}. It can be stopped now (Ctrl-C); the same "
+        f"command with --minutes {math.ceil(minutes * FEW_STEPS / max(steps, 1))} continues it."
+    )
+
+
 def forecast(pace: Pace, minutes: float, frames: int, training_s: float) -> str:
     """One sentence of what the minutes will give; TerrellaError where nothing can be learned in them."""
     steps, better = pace.steps_in(training_s), f"--minutes {max(pace.minutes_for(FEW_STEPS), math.ceil(minutes) + 1)}"

@@ -4,10 +4,12 @@ A round's practice begins with the policy of the highest return so far; the bett
 """
 
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from .. import library
 from ..act.actor import Actor
 from ..act.belief import BeliefPolicy, load_learned_policy
 from ..act.policies_by_name import NoisyPolicy
-from ..core.errors import TerrellaError
+from ..core.errors import DatasetError, TerrellaError, TrainingError
 from ..core.files import write_json
 from ..core.policy import Policy
 from ..core.spec import AXES, shape_of
@@ -29,6 +31,7 @@ from ..measure.statistics import mean_interval
 from .collect import explore, storage_of
 from .learn import check_budget
 from .learn_schedule import folder_for, refuse_foreign_folder, refuse_other_settings
+from .learn_trial import FEW_STEPS, HOPELESS_STEPS, TRIAL_FRAMES, slower
 from .opening import EnvironmentConfig
 from .progress import Progress, Report, silent, stage
 from .results import jsonable
@@ -45,6 +48,7 @@ BATCH, SAVE_EVERY_S = 64, 20.0
 RANDOM_SHARE = 0.1  # of a policy's actions while it collects: the world then learns the states beside its paths
 TRUST = 0.1  # the uncertainty from which PPO assumes the worst return
 TRIAL_EPISODES = 10
+TRIAL_MIN = 0.2  # of a short round before the first
 NOTES = "practise.json"
 
 
@@ -94,10 +98,15 @@ def practise(
         raise TerrellaError(f"--practise needs --frames of {FEWEST_FRAMES:,} or more.")
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed, **asdict(config.environment)}
     rounds = _Rounds(Path(config.out or folder_for(environment)), settings, config.minutes)
-    done = rounds.resume()
+    if not (rounds.folder / NOTES).exists():
+        refuse_foreign_folder(rounds.folder)
     real = _open(environment, config.environment)
     if "reward" not in real.spec.channels:
         raise TerrellaError(f"{environment} has no reward, which practice needs.")
+    if not rounds.recording.exists():
+        progress("A trial of some seconds: what does this machine manage?")
+        progress(_forecast(environment, real, config))
+    done = rounds.resume()
     for number in range(len(done), ROUNDS):
         progress(f"Round {number + 1} of {ROUNDS}, in {rounds.folder}.")
         try:
@@ -161,6 +170,27 @@ class _Rounds:
         write_json(self.folder / NOTES, {"asked": settings, "rounds": list(rounds)})
 
 
+def _forecast(name: str, real: World, config: PractiseConfig) -> str:
+    """One sentence of what the minutes will give, by a short round in a temporary folder; TerrellaError where nothing can be learned
+    in them."""
+    minutes = config.minutes / ROUNDS
+    with TemporaryDirectory() as folder:
+        rounds = _Rounds(Path(folder) / "trial", {}, TRIAL_MIN * ROUNDS)
+        try:
+            trial = _round(rounds, [], name, real, replace(config, frames=TRIAL_FRAMES * ROUNDS), silent)
+        except (DatasetError, TrainingError) as error:
+            return f"A trial of some seconds cannot say what {config.minutes:g} min will give: {error}"
+    steps, practised = (int(trial[at] * minutes / TRIAL_MIN) for at in ("world_steps", "steps"))
+    collected = trial["frames"] / trial["collected_s"] * 60 * minutes * SHARES[COLLECTING]
+    frames = int(np.clip(collected, LEAST_SHARE * config.frames / ROUNDS, config.frames / ROUNDS))
+    what = f"{ROUNDS} rounds of about {frames:,} frames, {steps:,} training steps of the world and {practised:,} of the policy"
+    better = f"--minutes {math.ceil(config.minutes * FEW_STEPS / max(steps, 1))}"
+    if steps < HOPELESS_STEPS:
+        raise TerrellaError(f"{config.minutes:g} min are too few on this machine, by a trial: {what}. Give {better}.")
+    little = f" That is little: {better} trains the world by {FEW_STEPS} steps." if steps < FEW_STEPS else ""
+    return f"Expected in {config.minutes:g} min, by a trial on this machine: {what}.{little}"
+
+
 def best_round(done: Sequence[Mapping[str, Any]]) -> int:
     """The round whose policy had the highest return when it collected, in the round after it; the first where none has yet."""
     return max(range(1, len(done)), key=lambda number: done[number]["return"], default=1) - 1
@@ -177,9 +207,11 @@ def _round(
     """One round: collects, learns the world, practises. Returns its notes."""
     number, seed, minutes = len(done), config.seed, rounds.round_minutes(done)
     seconds = {at: 60 * minutes * share for at, share in SHARES.items()}
+    began = time.monotonic()
     if not rounds.world(number).exists():  # a world exists only after collection
         with stage(COLLECTING, progress) as report:
             _collect(rounds, number, real, config, seconds[COLLECTING], report)
+    collected_s = time.monotonic() - began
     with stage(LEARNING, progress) as report:
         batch = None if "rgb" in real.spec.channels else BATCH
         latent = LatentTraining(
@@ -190,9 +222,11 @@ def _round(
             seed=seed,
             save_every_s=SAVE_EVERY_S,
         )
-        train_latent(rounds.recording, rounds.world(number), latent, report)
+        paced = lambda steps: progress(line) if (line := slower(steps, config.minutes)) else None  # noqa: E731
+        learned = train_latent(rounds.recording, rounds.world(number), latent, report, paced)
     world, before = library.load(rounds.world(number)), done[-1]["frames"] if done else 0
     notes = {"frames": Dataset(rounds.recording).length, "return": mean_return(rounds.recording, before)}
+    notes |= {"collected_s": collected_s, "world_steps": learned["step"]}
     with stage(PRACTISING, progress) as report:
         practice = Practice(minutes=seconds[PRACTISING] / 60, seed=seed, save_every_s=SAVE_EVERY_S)
         if world.spec.differentiable and world.spec.action_mode in AXES:

@@ -24,7 +24,7 @@ from ..objectives.latent_prediction import LatentPrediction, latent_clips, param
 from ..objectives.outcome import levels
 from ..recording import Recording
 from ..strips import write_lines
-from ..trainer import Report, Run, Trainer, device_named
+from ..trainer import Paced, Report, Run, Trainer, device_named
 
 STAGE = "latent"
 SIDE, COARSE = 64, 16  # pixels: the longer side at most, and of what sides are multiples
@@ -76,8 +76,11 @@ class LatentTraining:
     device: str = "auto"  # cpu, cuda or auto.
 
 
-def train_latent(data: str | Path, out: str | Path, config: LatentTraining, report: Report) -> dict:
-    """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run."""
+def train_latent(
+    data: str | Path, out: str | Path, config: LatentTraining, report: Report, paced: Paced | None = None
+) -> dict:
+    """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
+    `Trainer.train`."""
     _check(config)
     dataset = Dataset(data)
     size = config.size or fitted_size(dataset)
@@ -88,7 +91,7 @@ def train_latent(data: str | Path, out: str | Path, config: LatentTraining, repo
     run.saved_facts(STAGE)
     recording = Recording.open(dataset, size, report, needs=("action",), why=WHY).require_rows()
     torch.manual_seed(config.seed)
-    return _Training(run, recording, config).learn()
+    return _Training(run, recording, config).learn(paced)
 
 
 def _check(config: LatentTraining) -> None:
@@ -213,10 +216,12 @@ class _Training:
         ]
         return max(long, default=1)
 
-    def learn(self) -> dict:
+    def learn(self, paced: Paced | None) -> dict:
         config, recording = self.config, self.recording
         steps = self._rollout()
-        batch = config.batch or (32 if self.sees_pictures else 128)
+        lengths = [np.subtract(*recording.cache.episodes[number][::-1]) for number in recording.seen]
+        clips = int(sum(max(0, length - config.history - steps + 1) for length in lengths))
+        batch = min(config.batch or (32 if self.sees_pictures else 128), clips)
         names = [name for name in ("action", "reward", "done") if getattr(recording.cache, name) is not None]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
         settings = ClipsConfig(config.history + steps, names, batch, seed=config.seed, episodes=recording.seen)
@@ -228,7 +233,7 @@ class _Training:
         if not trainer.finished:
             trainer.facts.pop("validation", None)
             done = False
-        trainer.train(lambda: self.draw_strip(trainer))
+        trainer.train(lambda: self.draw_strip(trainer), paced)
         if not done:
             self._finish(trainer)
         summary = {name: fact for name, fact in trainer.summary.items() if name != "validation"}

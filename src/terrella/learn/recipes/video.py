@@ -18,7 +18,7 @@ from ..budget import Stage
 from ..objectives.uncertainty import discard_uncertainty, uncertainty_seconds
 from ..recording import Recording
 from ..strips import draw_strip
-from ..trainer import Report, Run, Trainer, device_named
+from ..trainer import Paced, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
 from .video_flat import CodecRecipe, FlatFlowRecipe
@@ -30,9 +30,12 @@ TUNING = 0.06  # the part of the hours that tuning may take
 WHY = "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
 
 
-def train_video(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> dict:
-    """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run."""
-    return _Training(_recipe(data, out, config, report)).learn()
+def train_video(
+    data: str | Path, out: str | Path, config: TrainConfig, report: Report, paced: Paced | None = None
+) -> dict:
+    """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
+    `Trainer.train`, of the generator's steps."""
+    return _Training(_recipe(data, out, config, report), paced).learn()
 
 
 class TrainingPace(NamedTuple):
@@ -86,8 +89,8 @@ def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Repo
 class _Training:
     """The stages of a run, each of which resumes where it was stopped."""
 
-    def __init__(self, recipe: VideoRecipe):
-        self.recipe, self.parts = recipe, recipe.parts
+    def __init__(self, recipe: VideoRecipe, paced: Paced | None = None):
+        self.recipe, self.parts, self.paced = recipe, recipe.parts, paced
         self.run, self.config = recipe.parts.run, recipe.parts.config
         self.stages = [
             *recipe.preparations(),
@@ -114,7 +117,7 @@ class _Training:
         if not trainer.finished:
             discard_uncertainty(self.run.out)  # it was fitted to the errors of an earlier generator
             trainer.facts.pop("senses", None)
-        trainer.train(self._save_with_strip)
+        trainer.train(self._save_with_strip, self.paced)
 
     def _limit_s(self) -> float:
         """Seconds of the generator's training: what the preparations left of the hours, less what tuning and uncertainty will
