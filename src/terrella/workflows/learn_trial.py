@@ -62,8 +62,8 @@ def slower(steps: int, minutes: float) -> str | None:
         return None
     what = "too few to learn anything" if steps < HOPELESS_STEPS else "which is little"
     return (
-        f"At the pace of its first steps training will have about {steps:,} steps, {what}. It can be stopped now (Ctrl-C); the same "
-        f"command with --minutes {math.ceil(minutes * FEW_STEPS / max(steps, 1))} continues it."
+        f"At the pace of its first steps training will have about {steps:,} steps, {what}. It can be stopped now (Ctrl-C); the "
+        f"same command with --minutes {math.ceil(minutes * FEW_STEPS / max(steps, 1))} continues it."
     )
 
 

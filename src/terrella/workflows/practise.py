@@ -171,8 +171,8 @@ class _Rounds:
 
 
 def _forecast(name: str, real: World, config: PractiseConfig) -> str:
-    """One sentence of what the minutes will give, by a short round in a temporary folder; TerrellaError where nothing can be learned
-    in them."""
+    """One sentence of what the minutes will give, by a short round in a temporary folder; TerrellaError where nothing can be
+    learned in them."""
     minutes = config.minutes / ROUNDS
     with TemporaryDirectory() as folder:
         rounds = _Rounds(Path(folder) / "trial", {}, TRIAL_MIN * ROUNDS)
