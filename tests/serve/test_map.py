@@ -90,7 +90,7 @@ def inside(page) -> np.ndarray:
 def test_the_map_shows_keyframes_by_kind_and_the_camera(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped(dt_s=1 / 100)]).url)
     until(page, f"terrella.map.shown && terrella.map.places === {SLOTS}")
-    assert page.locator("#map-known").text_content() == "33% from memory, 17% imagined before"
+    assert page.locator("#map-known").text_content() == "33% from memory + 17% invented earlier"
     assert page.locator("#map-kinds span").all_text_contents() == ["3 recorded", "3 observed", "2 imagined"]
     page.keyboard.down("KeyW")
     until(page, "terrella.map.path > 8 && terrella.map.camera[0] > 1")

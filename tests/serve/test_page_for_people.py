@@ -99,6 +99,9 @@ def test_what_a_person_does_comes_first_and_hits_and_death_are_shown(serve_world
     page.keyboard.down("Space")
     until(page, "document.getElementById('app').classList.contains('ended')")
     page.keyboard.up("Space")
+    until(page, "document.getElementById('vital-health').textContent === '0'")  # of -20
+    titles = [page.get_attribute(f".vital:has(#vital-{name})", "title") for name in ("health", "hit", "fallen")]
+    assert "At 0" in titles[0] and "hit something" in titles[1] and "have fallen" in titles[2]
     assert page.text_content("#ending-text") == "You died" and "hits" in page.text_content("#ending-more")
     until(page, "!document.getElementById('app').classList.contains('ended')")
     until(page, "document.getElementById('vital-hit').textContent === '0'")

@@ -1,4 +1,4 @@
-"""The start page: cards, thumbnails, one page at a time at the same address, and the way back."""
+"""The start page: cards, thumbnails, one page at a time, and the way back."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Drawer:
             raise TerrellaError("broken cannot be opened; choose another.")
         if name == "a recording":
             return lambda host, token: build_viewer(Browse(rig.lively(1), self.marks), host, token)
-        sessions = Sessions([Panorama()], ServeConfig(home=True))
+        sessions = Sessions([Panorama()], ServeConfig())
         return lambda host, token: build_app(sessions, host, token)
 
     def build(self, words):
@@ -93,7 +93,7 @@ def client(token=None):
         yield SimpleNamespace(get=ask, post=ask)
 
 
-def test_what_is_opened_is_at_the_same_address_and_the_start_page_stays():
+def test_what_is_opened_has_an_address_of_its_own_and_the_start_page_stays():
     with client() as http:
         assert "Step inside" in http.get("/").text and [
             card["name"] for card in json.loads(http.get("/start/cards").text)
@@ -105,8 +105,9 @@ def test_what_is_opened_is_at_the_same_address_and_the_start_page_stays():
         assert http.get("/start/thumbnail?name=hills").headers["content-type"] == "image/jpeg"
         assert http.get("/start/thumbnail?name=../secret").status == 404
         assert http.post("/start/open", json.dumps({"name": "hills"})).status == 200
-        assert 'id="timeline"' in http.get("/").text and http.get("/check").text == "ok"
-        assert "Step inside" in http.get("/start").text
+        assert 'id="timeline"' in http.get("/?open").text and http.get("/check").text == "ok"
+        assert 'id="timeline"' in http.get("/?token=x&open=").text and "Step inside" in http.get("/?token=open").text
+        assert "Step inside" in http.get("/").text, "who opens the address again is at the start"
         assert http.post("/start/build", json.dumps({"words": "a hall"})).status == 200
 
 
@@ -138,6 +139,13 @@ def test_a_click_opens_a_world_and_its_mark_leads_back(browser):
         page.click("text=Hills")
         page.wait_for_selector("#timeline")
         until(page, "!!window.terrella && terrella.painted > 2")
+        assert page.text_content("#brand").strip() == "Start page"
+        other = browser.new_context().new_page()  # a tab that knows nothing of this one
+        other.goto(page.url)
+        other.wait_for_selector("#brand[href]")
+        other.goto(url)
+        other.wait_for_selector(".card")
+        other.context.close()
         page.press("#brand", "Enter")
         page.wait_for_selector(".card")
         page.click("text=A Recording")

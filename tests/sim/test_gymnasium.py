@@ -14,7 +14,7 @@ from gymnasium import spaces
 import terrella
 from terrella.core import Camera, State, check_world, make_rng
 from terrella.core.errors import ActionError, ObservationError, StaleStateError, TerrellaError
-from terrella.core.spec import POSE, POSE_UNIT
+from terrella.core.spec import POSE, POSE_UNIT, can_idle
 from terrella.sim.environment_loading import use_tracking_camera
 from terrella.sim.gymnasium import Adapter, Channel, GymnasiumConfig, GymnasiumWorld
 
@@ -479,3 +479,35 @@ def test_who_runs_in_a_mujoco_environment_stays_in_the_picture(cameras, config, 
     renderer = SimpleNamespace(camera_id=-1, default_cam_config=config, model=model)
     use_tracking_camera(SimpleNamespace(unwrapped=SimpleNamespace(mujoco_renderer=renderer)))
     assert renderer.camera_id == drawn_by
+
+
+@pytest.mark.parametrize(
+    ("name", "names", "keys"),
+    [
+        ("CartPole-v1", ("push left", "push right"), {"ArrowLeft": 0, "KeyD": 1}),
+        ("MountainCar-v0", ("push left", "no push", "push right"), {"ArrowLeft": 0, "ArrowRight": 2}),
+        ("Acrobot-v1", ("torque -1", "no torque", "torque +1"), {"ArrowRight": 2}),
+        ("FrozenLake-v1", ("left", "down", "right", "up"), {"ArrowDown": 1, "KeyW": 3}),
+        ("Taxi-v4", ("south", "north", "east", "west", "pickup passenger", "drop off passenger"), {"Space": 4}),
+    ],
+)
+def test_gymnasiums_own_environments_have_the_names_of_their_documentation(name, names, keys):
+    spec = GymnasiumWorld(name, GymnasiumConfig(rgb=False)).spec
+    assert spec.action_names == names and spec.card["how"]["action names"] == "Gymnasium's documentation"
+    assert {code: spec.keys[code] for code in keys} == {code: [float(at)] for code, at in keys.items()}
+    assert spec.keys.keys().isdisjoint({"KeyP", "KeyR", "KeyM"}), "those are the page's"
+    assert can_idle(spec) == (name in ("MountainCar-v0", "Acrobot-v1")), "what does nothing is known"
+
+
+def test_documented_names_are_for_gymnasiums_own_environments_alone():
+    class Other(gymnasium.Env):
+        action_space, observation_space = spaces.Discrete(2), spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return 0, {}
+
+    gymnasium.register("CartPole-v77", Other)
+    try:
+        assert GymnasiumWorld("CartPole-v77", GymnasiumConfig(rgb=False)).spec.action_names == ()
+    finally:
+        del gymnasium.registry["CartPole-v77"]

@@ -32,6 +32,7 @@ BUTTONS, CHOICE = "buttons", "choice"
 AXES = ("axes", "position", "velocity", "torque", "pose_delta")  # meanings of the numbers of a Box
 MODES = (BUTTONS, CHOICE, *AXES)
 _IDLE = {"noop", "idle", "none", "stay", "nothing", "donothing", "noaction", "wait", "still", "pass", "noopaction"}
+_IDLE |= {"nopush", "notorque"}
 
 
 def shape_of(space: spaces.Space) -> tuple[int, ...]:

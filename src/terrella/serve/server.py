@@ -51,7 +51,6 @@ class ServeConfig:
     history_s: float = 30.0  # seconds of pictures that are kept, for rewinding and clips
     state_mb: int = 256  # memory for the states among them, in MiB
     record_in: str = ""  # where `sink_factory` records, in words
-    home: bool = False  # whether there is a start page, to which the page links
 
 
 class Sessions:
@@ -132,7 +131,6 @@ class Sessions:
             no_rewind=no_rewind(self.worlds),
             command=starting_command(),
             record_in=self.config.record_in,
-            home=self.config.home,
             no_record="" if self._sink_factory else "start the server with --record FOLDER.",
             agent=self._agents is not None,
             goals={

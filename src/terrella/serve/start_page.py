@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import re
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
@@ -15,9 +16,10 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from ..core.errors import ServeError, TerrellaError
-from .http_server import WEB, application, posted, serve_page
+from .http_server import application, posted, serve_page
 
 MOST_WORDS = 4096  # bytes of a request
+_OPEN = re.compile(rb"(^|&)open(=|&|$)")  # in the address of the page that is open
 Build = Callable[[str, str | None], Starlette]  # (host, token) -> the application of a page
 
 
@@ -50,7 +52,7 @@ class Shelf(Protocol):
 
 
 class StartPage:
-    """An ASGI application: the start page at /start, and at / the page that was opened last. It shows one at a time, because each
+    """An ASGI application: the start page at /, and at /?open the page that was opened last. It shows one at a time, because each
     uses the machine for itself."""
 
     def __init__(self, shelf: Shelf, host: str = "127.0.0.1", token: str | None = None):
@@ -66,13 +68,12 @@ class StartPage:
         self.state = self._page.state
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        start = self._open is None or scope["type"] == "lifespan" or scope["path"].startswith("/start")
-        await (self._page if start or self._open is None else self._open)(scope, receive, send)
+        path, page = scope.get("path", ""), self._open
+        start = path.startswith("/start/") or path == "/" and not _OPEN.search(scope["query_string"])
+        await (self._page if start or page is None or scope["type"] == "lifespan" else page)(scope, receive, send)
 
     def _routes(self) -> list[Route]:
-        show = Response((WEB / "start/index.html").read_bytes(), media_type="text/html")
         return [
-            Route("/start", lambda request: show),
             Route("/start/cards", self._cards),
             Route("/start/thumbnail", self._thumbnail),
             Route("/start/open", self._opens, methods=["POST"]),
@@ -108,7 +109,7 @@ class StartPage:
         return await self._answer(request, "words", self._shelf.build)
 
     async def _answer(self, request: Request, field: str, name_of: Callable[[str], str]) -> Response:
-        """Opens what a POST names, or what is made of its words; the page goes to / then."""
+        """Opens what a POST names, or what is made of its words; the browser goes to /?open then."""
         try:
             text = json.loads(await posted(request, MOST_WORDS))[field]
             if not isinstance(text, str) or not text.strip():

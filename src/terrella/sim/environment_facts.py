@@ -12,6 +12,7 @@ from gymnasium import spaces
 from ..core.keys import default_keys, parse_keys
 from ..core.spec import idle_name
 from ..core.step_length import step_length
+from .gymnasium_actions import documented_actions
 
 _NAMERS = ("get_action_meanings", "action_meanings", "get_action_names", "action_names", "get_combos")
 DEFAULT_FPS = 10  # of an environment without a frame rate
@@ -29,10 +30,14 @@ class EnvironmentFacts:
 
 def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
     """Reads the facts from an environment that has been reset, and may step it. Action names: `names`, `get_action_meanings` and
-    the like, an `Actions` enum, or any attribute with "action" in its name that names each action. Keys: `get_keys_to_action`.
+    the like, an `Actions` enum, or any attribute with "action" in its name that names each action; last, the documentation of
+    Gymnasium. Keys: `get_keys_to_action`.
     Time: see `step_length`."""
     space, bare = env.action_space, env.unwrapped
     labels, source = (tuple(names), "its adapter") if names else _names(bare, space)
+    documented = documented_actions(env)
+    if not labels and isinstance(space, spaces.Discrete) and len(documented.names) == space.n:
+        labels, source = documented.names, "Gymnasium's documentation"
     dt_s, clock = step_length(env)
     how = {"action names": source or "without names", "frame rate": clock if dt_s else f"{clock}, so {DEFAULT_FPS}"}
     table = _called(getattr(bare, "get_keys_to_action", None)) or getattr(bare, "keys_to_action", None)
@@ -41,6 +46,8 @@ def facts_of(env: gymnasium.Env, names: Sequence[str] = ()) -> EnvironmentFacts:
     if isinstance(space, spaces.Discrete) and idle is not None:  # no key is pressed for it
         keys = {code: action for code, action in keys.items() if action != [idle + space.start]}
     how["keys"] = "get_keys_to_action" if keys else "by the actions' names" if labels else "default"
+    if labels == documented.names:
+        keys = keys or {code: [float(at)] for code, at in documented.keys.items()}
     return EnvironmentFacts(labels, keys or default_keys(space, labels), dt_s or 1 / DEFAULT_FPS, how)
 
 

@@ -4,7 +4,6 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image
@@ -82,7 +81,7 @@ class FolderShelf:
                 browse(name, carry=repair), host, token, out.with_name(f"{out.name}-good")
             )
         worlds, page, options = prepared(name, self._config, self._controls, self._page, self._progress)
-        sessions = Sessions(worlds, replace(page, home=True), **options)
+        sessions = Sessions(worlds, page, **options)
         return lambda host, token: build_app(sessions, host, token)
 
     def build(self, words: str) -> str:

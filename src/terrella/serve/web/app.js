@@ -10,13 +10,13 @@ import { KeyPanel } from './keypanel.js';
 import { DONE, FRESH, Link, REPLAY } from './link.js';
 import { Past, write } from './past.js';
 import { takePictures } from './picture.js';
-import { reach } from './place/reach.js';
+import { linkBack, reach } from './place/reach.js';
 import { Screens } from './screens.js';
 import { Uncertainty } from './uncertainty.js';
 import { Views } from './views.js';
 
 const $ = (id) => document.getElementById(id);
-const app = $('app'), KEPT = 8192;
+const app = $('app'), KEPT = 8192, LIFE = /^(health|life|lives|hp|hitpoints)$/i;
 
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
@@ -81,7 +81,6 @@ function onEvent(body) {
 function hello(body) {
   const same = JSON.stringify(worlds) === JSON.stringify(body.worlds);
   ({ worlds, no_record: noRecord, command, record_in: recordIn } = body);
-  if (body.home) $('brand').href = `/start?${link.params()}`;
   driver.take(body);
   past.take(worlds[0], body.no_rewind);
   if (panel.take(worlds[0])) sendKeys();
@@ -165,7 +164,7 @@ function build() {
   $('score-cell').hidden = !worlds[0].scored;
   document.querySelectorAll('.vital').forEach((cell) => cell.remove());
   for (const name of worlds[0].vitals) {
-    const cell = Object.assign(document.createElement('div'), { className: 'vital' });
+    const cell = Object.assign(document.createElement('div'), { className: 'vital', title: explained(name) });
     cell.append(Object.assign(document.createElement('dt'), { textContent: label(name) }));
     cell.append(Object.assign(document.createElement('dd'), { id: `vital-${name}`, textContent: '–' }));
     $('score-cell').after(cell);
@@ -194,9 +193,19 @@ function able(button, why, title) {
 /** How a number is called: events are counted. */
 function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) && !/(n|ed)$/.test(name) ? 's' : ''); }
 
+/** What a number means; '' where its name says it. */
+function explained(name) {
+  if (!worlds[0].events.includes(name)) return LIFE.test(name) ? 'At 0 the episode ends' : '';
+  const what = { hit: 'Shots of yours that hit something', fallen: 'Opponents that have fallen' };
+  return `${what[name] ?? `How often “${name.replaceAll('_', ' ')}” happened`} in this episode`;
+}
+
+/** A number as it is shown: nobody has less than no health, though a blow may take more than was left. */
+function figure(name, value) { return +(LIFE.test(name) ? Math.max(0, value) : value).toFixed(1); }
+
 /** The last picture of an episode, with how it ended, until the next begins. */
 function showEnding({ outcome, text, steps }) {
-  const seconds = steps * worlds[0].dt_s, numbers = worlds[0].vitals.map((name, at) => [name, now.vitals[at]]).filter(([name, value]) => value && name !== 'health');
+  const seconds = steps * worlds[0].dt_s, numbers = worlds[0].vitals.map((name, at) => [name, now.vitals[at]]).filter(([name, value]) => value && !LIFE.test(name));
   $('ending-text').textContent = text;
   $('ending-more').textContent = [...numbers.map(([name, value]) => `${+value.toFixed(1)} ${label(name)}`), worlds[0].scored && `score ${+now.score.toFixed(1)}`, `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`].filter(Boolean).join(' · ');
   app.dataset.outcome = outcome;
@@ -257,7 +266,7 @@ function drawFigures() {
   if (recent.length) write('latency', Math.round(recent[recent.length >> 1]), 'ms');
   write('step', now.step.toLocaleString('en'));
   write('score', +now.score.toFixed(2));
-  worlds.length && worlds[0].vitals.forEach((name, at) => write(`vital-${name}`, +(now.vitals[at] ?? 0).toFixed(1)));
+  worlds.length && worlds[0].vitals.forEach((name, at) => write(`vital-${name}`, figure(name, now.vitals[at] ?? 0)));
   if (status.recording) {
     const s = Math.floor((performance.now() - recordSince) / 1000);
     write('rec-time', `${Math.floor(s / 60)}:${String(s % 60).padStart(2, '0')}`);
@@ -431,4 +440,5 @@ window.terrella = Object.freeze({
   drop: () => link.socket?.close(4999),
 });
 
+linkBack();
 link.connect();

@@ -40,9 +40,10 @@ export class MemoryMap {
   }
 
   tell(known, imagined) {
-    const source = this.keys.length && this.keys.every(({ kind }) => kind === 4) ? 'of the picture was observed' : 'from memory';  // a place has no views, only ground to walk on
-    const text = known === null ? '' : `${Math.round(100 * known)}% ${source}${imagined > 0.05 ? `, ${Math.round(100 * imagined)}% imagined before` : ''}`;
+    const place = this.keys.length > 0 && this.keys.every(({ kind }) => kind === 4);  // a place has no views, only ground to walk on
+    const text = known === null ? '' : `${Math.round(100 * known)}% ${place ? 'of the picture was observed' : 'from memory'}${imagined > 0.05 ? ` + ${Math.round(100 * imagined)}% invented earlier` : ''}`;
     const node = document.getElementById('map-known');
+    node.title = place ? 'The rest of the picture is invented' : 'Shares of the picture. From memory: places that were recorded or observed. Invented earlier: places that the world made up before, and shows again. The rest is invented now.';
     if (node.textContent !== text) node.textContent = text;
   }
 

@@ -8,8 +8,11 @@ export async function reach(address, command, options) {
   return answer;
 }
 
-/** Makes the mark a link to the start page, where the page was opened from one. */
+/** Makes the mark a link to the start page, where the page was opened from one: its address then has `open`. */
 export function linkBack() {
-  const start = location.protocol === 'file:' ? null : sessionStorage.getItem('terrella-start');
-  if (start) document.querySelector('.brand').href = start;
+  const query = new URLSearchParams(location.search), brand = document.querySelector('.brand');
+  if (!query.has('open')) return;
+  query.delete('open');
+  Object.assign(brand, { href: `/?${query}`, title: 'Back to the start page', ariaLabel: 'Back to the start page' });
+  brand.querySelector('.wordmark').textContent = 'Start page';
 }

@@ -23,8 +23,7 @@ async function go(path, body, words) {
     const answer = await fetch(`/start/${path}?${token.slice(1)}`, { method: 'POST', body: JSON.stringify(body) });
     if (!answer.ok) return show(await answer.text(), true);
     sessionStorage.removeItem('terrella-session');
-    sessionStorage.setItem('terrella-start', `/start?${token.slice(1)}`);
-    location.href = token ? `/?${token.slice(1)}` : '/';
+    location.href = `/?open${token}`;
   } catch {
     show('The server does not answer. Start it again: terrella play', true);
   }
