@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -118,6 +120,22 @@ def test_a_plan_ends_where_the_world_no_longer_knows():
         assert known == 12 if most == 12 else 1 <= known <= 4
     with pytest.raises(PlanningError, match="uncertainty"):
         planner(Grid(), "tree", negative_reward(Grid().spec), trust=0.1)
+
+
+def test_a_position_that_drifts_alike_under_every_plan_ends_none():
+    world, lost = Point(), Point()
+    lost.spec = replace(world.spec, channels={**world.spec.channels, "invented": world.spec.channels["uncertainty"]})
+    render = lost.render
+    lost.render = lambda state, channels: {
+        **render(state, [name for name in channels if name != "invented"]),
+        "invented": torch.zeros(state.batch),
+    }
+    goal = {"observation": torch.tensor([9.0, 0.0])}
+    for one, whole in ((world, False), (lost, True)):
+        start = one.observe({"observation": torch.tensor([[1.0, 0.0]])}, None, make_rng(0))
+        policy = planner(one, "icem", distance_to(one, goal), horizon=12, samples=64, trust=0.3)
+        _, memory = policy.act(one.render(start, SEEN), policy.begin(1, make_rng(0)), make_rng(0))
+        assert (memory[0].decision.trusted_moves == 12) == whole
 
 
 def test_nothing_is_chosen_by_chance_where_costs_are_no_numbers():

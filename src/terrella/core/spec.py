@@ -197,6 +197,12 @@ def can_idle(spec: Spec) -> bool:
     return spec.action_mode != CHOICE or bool(spec.idle) or idle_name(spec.action_names) is not None
 
 
+def trust_channel(spec: Spec) -> str:
+    """The channel whose value ends what is imagined, where it is above a limit: `invented`, for a position drifts under every plan
+    alike; the whole `uncertainty` in worlds that do not tell its parts apart."""
+    return "invented" if "invented" in spec.channels else "uncertainty"
+
+
 def neutral_action(spec: Spec) -> np.ndarray:
     """The action [*action.shape] that does least: `spec.idle` where it is given; else no button; the choice whose name means doing
     nothing, or the first; axes at 0, or at the limit nearest to 0."""

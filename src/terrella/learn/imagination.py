@@ -17,7 +17,7 @@ from ..act.actor_network import ActorNetwork
 from ..core.errors import ChannelError, DatasetError, ObservationError
 from ..core.policy import Random
 from ..core.rollouts import rollout
-from ..core.spec import Spec
+from ..core.spec import Spec, trust_channel
 from ..core.state import State
 from ..core.world import World, make_rng
 from .growth import Growth
@@ -174,7 +174,7 @@ class Imagination:
         world, config, spec = self.world, self.network.config, self.world.spec
         observed = tuple(name for name, _ in config.sees)
         outcomes = [name for name in ("reward", "done", "done_probability") if name in spec.channels]
-        outcomes += ["uncertainty"] if self.trust is not None else []
+        outcomes += [trust_channel(spec)] if self.trust is not None else []
         channels = tuple(dict.fromkeys((*observed, *outcomes)))
         frames, actions, steps = [dict(world.render(state, channels))], [], []
         for _ in range(self.steps):
@@ -197,7 +197,7 @@ class Imagination:
         if "done" in frame:
             continues = continues * ~frame["done"].to(device)
         if self.trust is not None:
-            trusted = frame["uncertainty"].to(device).detach() <= self.trust
+            trusted = frame[trust_channel(self.world.spec)].to(device).detach() <= self.trust
         return reward, continues, trusted
 
 

@@ -7,6 +7,7 @@ import torch
 
 from ...core.errors import PlanningError
 from ...core.rollouts import advance
+from ...core.spec import trust_channel
 from ...core.state import State
 from ...core.world import Observation, World, make_rng
 from .costs import LATENT, Cost
@@ -69,7 +70,7 @@ class PlanningProblem:
     seeds: list[int]  # one an episode
     horizon: int  # moves
     block: int = 1  # steps
-    trust: float | None = None  # largest value of the channel `uncertainty` that counts as known
+    trust: float | None = None  # largest value of the world's `trust_channel` that counts as known
     episode_seeds: EpisodeSeeds = field(default_factory=EpisodeSeeds)
     imagined_steps: int = 0  # so far, of each episode
 
@@ -77,7 +78,7 @@ class PlanningProblem:
         self.trusted_moves = torch.full((self.batch,), self.horizon)
         self.shortened = torch.zeros(self.batch, dtype=torch.bool)
         done = ("done",) if self.cost.until_done and "done" in self.world.spec.channels else ()
-        uncertainty = ("uncertainty",) if self.trust is not None else ()
+        uncertainty = (trust_channel(self.world.spec),) if self.trust is not None else ()
         self._channels = tuple(dict.fromkeys((*self.cost.channels, *done, *uncertainty)))
         leap = self.world.spec.leap
         self._leaps = bool(leap) and self.block % leap == 0 and self.cost.over == "last" and self._channels == (LATENT,)
@@ -133,7 +134,7 @@ class PlanningProblem:
                 going = ~seen["done"].cpu()
                 alive = going if alive is None else alive & going
             if self.trust is not None:
-                trusted = (seen["uncertainty"].cpu() <= self.trust).float().mean(1)
+                trusted = (seen[trust_channel(self.world.spec)].cpu() <= self.trust).float().mean(1)
             total = self.cost.accumulate(total, step)
         assert total is not None
         return state, total, alive, trusted

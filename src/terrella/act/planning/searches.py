@@ -40,8 +40,9 @@ class SearchConfig:
     # Milliseconds per decision, in place of `iterations`; at least one round is done. Results then depend on the speed of the
     # machine: the same seed need not give the same plan.
     budget_ms: float | None = None
-    # A plan is cut short at the step where half of the candidates exceed this value of the world's channel `uncertainty`. Without
-    # it, `terrella plan` and the policy `plan` use the threshold that the world declares, if any.
+    # A plan is cut short at the step where half of the candidates exceed this value of the world's channel `invented`, or of
+    # `uncertainty` where it has no such channel. Without it, `terrella plan` and the policy `plan` use the threshold that the world
+    # declares, if any.
     trust: float | None = None
     elites: int = 0
     """Best candidates of a round, to which the sampling distribution is fitted. 0 means an eighth of the samples."""

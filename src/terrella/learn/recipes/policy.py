@@ -58,8 +58,8 @@ class Practice:
     entropy: float | None = None
     # --no-gradients: with continuous actions use REINFORCE, although the world is differentiable.
     gradients: bool = True
-    # Uncertainty of the world at which a rollout ends. Default: the world's own threshold for invented content, if it declares
-    # one.
+    # Expected error of what the world invents (of a latent world: its uncertainty) at which a rollout ends. Default: the world's
+    # own threshold for invented content, if it declares one.
     trust: float | None = None
     # Where --trust ends a rollout, bootstrap from the lowest value in the batch instead of the critic's estimate.
     cautious: bool = False
