@@ -187,6 +187,19 @@ def test_nothing_lies_on_anything_on_a_phone(serve_world, open_page, screen):  #
             assert apart or one["bottom"] <= two["top"] + 1 or two["bottom"] <= one["top"] + 1, (name, other)
 
 
+def test_labels_of_buttons_keep_apart_on_a_phone(serve_world, open_page):  # noqa: F811
+    page = open_page(serve_world([Range()]).url, **PHONE)
+    page.evaluate(
+        "() => ['drive', 'futures-open', 'map-open'].forEach((id) => document.getElementById(id).hidden = false)"
+    )
+    labels = page.evaluate(
+        """() => [...document.querySelectorAll('.buttons .icon')].filter((node) => node.checkVisibility())
+          .map((node) => node.querySelector('span').getBoundingClientRect().toJSON())"""
+    )
+    assert len(labels) == 8 and labels[-1]["right"] <= 390
+    assert all(two["left"] - one["right"] > 5 for one, two in zip(labels, labels[1:]))
+
+
 class ManyJoints(Robot):
     """A robot with eight motors of 150 N m."""
 
