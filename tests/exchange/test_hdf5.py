@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -334,6 +335,36 @@ def test_flat_pictures_are_lazy_and_right(tmp_path):
     assert [len(take.readings["action"].values) for take in takes] == [4, 6]
     values = takes[1].readings["observation.images.rgb"].values
     np.testing.assert_array_equal(np.stack(list(values)), np.concatenate([here[4:], after[-1:]]))
+
+
+@pytest.mark.parametrize("padded", [True, False])
+def test_rows_of_jpeg_files_are_pictures(tmp_path, padded):
+    """As ALOHA keeps them: of one length, padded with zeros; or each of its own length."""
+    rng = np.random.default_rng(0)
+    truth = np.repeat(np.repeat(rng.integers(0, 255, (5, 3, 4, 3), dtype=np.uint8), 16, 1), 16, 2)
+    files = [simplejpeg.encode_jpeg(np.ascontiguousarray(one), 95, colorspace="RGB") for one in truth]
+    assert len({len(one) for one in files}) > 1
+    with h5py.File(tmp_path / "episode_0.hdf5", "w") as file:
+        file["action"], file["observations/qpos"] = np.zeros((5, 14), np.float32), np.zeros((5, 14), np.float32)
+        if padded:
+            length = max(map(len, files))
+            rows_ = np.stack([np.frombuffer(one.ljust(length, b"\0"), np.uint8) for one in files])
+            file["observations/images/cam_high"] = rows_
+            file["compress_len"] = np.array([[len(one) for one in files]])
+        else:
+            kept = file.create_dataset("observations/images/cam_high", (5,), h5py.vlen_dtype(np.uint8))
+            for at, one in enumerate(files):
+                kept[at] = np.frombuffer(one, np.uint8)
+        file["observations/tactile"] = np.full((5, 400), 255, np.uint8)
+    source = hdf5.read(tmp_path / "episode_0.hdf5", fps=50)
+    (name,) = (name for name in source.sensors if name.endswith("cam_high"))
+    assert source.sensors[name].kind == "image" and source.sensors[name].shape == (48, 64, 3)
+    (take,) = source.takes()
+    seen = stacked(take.readings[name]).astype(int)
+    assert seen.shape == truth.shape and np.abs(seen - truth).mean() < 4
+    assert any("JPEG" in note and "cam_high" in note for note in source.notes)
+    (tactile,) = (sensor for name, sensor in source.sensors.items() if "tactile" in name)
+    assert tactile.shape == (400,), "numbers stay numbers"
 
 
 def test_flat_arrays_of_other_lengths_are_refused(tmp_path):

@@ -22,6 +22,7 @@ GYMNASIUM = {  # the arrays of a rollout, as Gymnasium and Minari name them
     "terminations": rows.DONE,
     "truncations": rows.TRUNCATED,
 }
+_JPEG = b"\xff\xd8\xff"  # how such a file begins
 Guess = Callable[[Place, tuple[int, ...], np.dtype], Sensor | None]
 
 
@@ -67,7 +68,7 @@ def jpeg_rows(count: int, shape: tuple[int, ...], packed: Callable[[int], bytes]
 
 
 def fields(place: Place, array: Array) -> Iterator[tuple[Place, Array]]:
-    """The array, or one array for each field of its records (a structured dtype)."""
+    """The array, or one array for each field of its records (a structured dtype); rows that are JPEG files are pictures."""
     for name in array.dtype.names or ():
         base, inner = array.dtype[name].subdtype or (array.dtype[name], ())
 
@@ -76,7 +77,28 @@ def fields(place: Place, array: Array) -> Iterator[tuple[Place, Array]]:
 
         yield from fields((*place, name), Array((*array.shape, *inner), base, read))
     if not array.dtype.names:
-        yield place, array
+        yield place, _unpacked(place, array)
+
+
+def _unpacked(place: Place, array: Array) -> Array:
+    """The pictures of an array with a JPEG file per row: of one length, padded, as ALOHA keeps them, or of lengths of their own."""
+    padded = array.dtype == np.uint8 and len(array.shape) == 2
+    apart = (array.dtype.metadata or {}).get("vlen") == np.uint8 and len(array.shape) == 1
+    if not (padded or apart) or not array.shape[0] or array.read is _unreadable:
+        return array
+
+    def packed(i: int) -> bytes:
+        return np.asarray(array.read(i, i + 1)[0], np.uint8).tobytes()
+
+    first = packed(0)
+    if not first.startswith(_JPEG):
+        return array
+    try:
+        with Image.open(io.BytesIO(first), formats=("JPEG",)) as picture:
+            shape = picture.height, picture.width, len(picture.getbands())
+    except rows.PICTURE_ERRORS:
+        return array
+    return jpeg_rows(array.shape[0], shape, packed, f"'{spelled(place)}'")
 
 
 def texts(array: Array) -> list[str]:

@@ -23,6 +23,11 @@ def read(path: Path, fps: float | None) -> Source:
         bare = flat.is_bare(episodes.stored)
         sensors, notes = arrays.columns(episodes.stored, partial(flat.guess, bare), "the array")
         metadata, more = _metadata(file)
+        more += [
+            f"'{arrays.spelled(place)}' holds JPEG files, read as RGB; some recorders exchange red and blue: look at one."
+            for place, item in hdf5_file.all_datasets(file)
+            if item.ndim in (1, 2) and len(episodes.stored.get(flat.home(place), item).shape) == 4
+        ]
         facts = {"attributes": hdf5_file.attributes(file), **({"metadata": metadata} if metadata else {})}
     if not episodes.spans[-1][1]:
         raise DatasetError(f"{path} has no rows; there is nothing to read.")
