@@ -12,6 +12,7 @@ from .batches import Dream, place_batch
 from .history_batches import clip_length, history_batch
 from .moving_batches import moving_batch
 from .objectives import codec
+from .objectives.flow_frames import FlowClipMaker
 from .recording import Recording
 from .trainer import Feed, TrainStep
 
@@ -67,6 +68,11 @@ def codec_feed(recording: Recording, config: VideoConfig, flow: codec.CodecObjec
     return ClipStream(clips, codec.ClipMaker(controls, flow.generator.moves.cpu(), flow.over, flow.spans, size))
 
 
+def flow_feed(recording: Recording, config: VideoConfig, spans: codec.Spans, maker: FlowClipMaker, seed: int) -> Feed:
+    """Clips for a flow of frames, chosen from three times as many, preferring those that change more."""
+    return ClipStream(clips_of(recording, spans.length, 3 * maker.batch, config, seed, drop_last=False), maker)
+
+
 def clips_of(
     recording: Recording, length: int, size: int, config: VideoConfig, seed: int, drop_last: bool = True
 ) -> Clips:
@@ -75,7 +81,7 @@ def clips_of(
     whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
-    channels = ("rgb", "action", *("instruction",) * ("task" in recording.cache.arrays))
+    channels = ("rgb", "action", "row", *("instruction",) * ("task" in recording.cache.arrays))
     return Clips(
         recording.cache,
         ClipsConfig(length, channels, size, config.size, seed=seed, drop_last=drop_last, episodes=whole),

@@ -12,9 +12,9 @@ import torch
 import torch.nn.functional as F
 
 from ..core.files import write_json
-from ..space.ground import joined
+from ..space.ground import joined, window
 from ..space.matching import gather_sources, half_pixel_bounds, scroll_index
-from ..space.mosaic import empty_mosaic, update_mosaic
+from ..space.mosaic import empty_mosaic, middle, update_mosaic
 from .recording import Recording
 
 REACH, NEAR = 24, 5  # pixels of the longest move in a step, and those up to which all moves are tried at full size
@@ -23,7 +23,7 @@ DIFFERENT = 4.0  # mean difference (of 255) above which a block has changed
 MOVE_COST = 0.05  # by which each pixel of a move must reduce the error
 SAME = 8  # difference of 255 up to which a pixel is unchanged
 GROUND = 9  # height and width of the canvas on which an episode's pictures are stitched, in pictures
-STITCHED = 12_000  # frames at most
+STITCHED = 20_000  # frames at most
 FEWEST = 32  # scrolling pairs needed to find the overlay
 STATISTICS = "looks.json"  # in the folder of a run
 
@@ -150,22 +150,53 @@ def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real:
     return mosaic
 
 
+@dataclass(frozen=True)
+class StitchedEpisodes:
+    """What the episodes of a recording scrolled over: `grounds` uint8 [4, H', W'], by episode, and the `place` int64 [N, 2], x and
+    y, of each row's picture on the ground of its `episode` int64 [N]; -1 where an episode is not stitched."""
+
+    grounds: Mapping[int, torch.Tensor]
+    place: torch.Tensor
+    episode: torch.Tensor
+
+    def memory(self, rows: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+        """What their grounds know of the pictures of `rows` int64 [B]: uint8 [B, 4, H, W], colour and votes."""
+        known = torch.zeros(len(rows), 4, *size, dtype=torch.uint8)
+        for number, row in enumerate(rows.tolist()):
+            ground = self.grounds.get(int(self.episode[row]))
+            if ground is not None:
+                known[number] = window(ground, self.place[row : row + 1], size)[0]
+        return known
+
+
+def stitch_episodes(recording: Recording, moves: torch.Tensor, over: torch.Tensor) -> StitchedEpisodes:
+    """The pictures of the episodes for training, stitched by how they scroll."""
+    length, left = recording.cache.length, STITCHED
+    place, number = torch.zeros(length, 2, dtype=torch.int64), torch.full((length,), -1)
+    grounds = {}
+    for episode in recording.seen:
+        first, last = recording.cache.episodes[episode]
+        last, whole, before = min(last, first + left), None, recording.rgb([first])
+        left -= last - first
+        for row in range(first, last):
+            frame = recording.rgb([row])
+            if whole is None:
+                whole = torch.zeros(1, 4, *(GROUND * side for side in frame.shape[-2:]), dtype=torch.uint8)
+            move = moves[scroll_index(before, frame, moves)]
+            whole = update_mosaic(whole, frame, move, over)
+            place[row], number[row] = place[max(row - 1, first)] - move[0], episode
+            before = frame
+        if whole is not None:  # the last picture lies in the middle
+            centre = torch.tensor(middle(whole, before.shape[-2:])[::-1])
+            place[first:last] += centre - place[last - 1]
+            grounds[episode] = whole[0]
+    return StitchedEpisodes(grounds, place, number)
+
+
 def ground_of(recording: Recording, moves: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
     """The ground (space/ground.py) over which the recording's episodes for training scrolled, uint8 [4, H, W]: their pictures
     stitched, and those of several episodes where they overlap."""
-    wholes, rows_left = [], STITCHED
-    for first, last in (recording.cache.episodes[episode] for episode in recording.seen):
-        before, whole = recording.rgb([first]), None
-        for row in range(first, min(last, first + rows_left)):
-            frame = recording.rgb([row])
-            size = [GROUND * side for side in frame.shape[-2:]]
-            whole = torch.zeros(1, 4, *size, dtype=torch.uint8) if whole is None else whole
-            whole = update_mosaic(whole, frame, moves[scroll_index(before, frame, moves)], over)
-            before = frame
-        rows_left -= last - first
-        if whole is not None:
-            wholes.append(whole[0])
-    return joined(wholes)
+    return joined(list(stitch_episodes(recording, moves, over).grounds.values()))
 
 
 def _around(plane: torch.Tensor) -> torch.Tensor:

@@ -53,6 +53,10 @@ class TrainStep:
         """Standard normal noise on the device; drawn on the CPU, so that it is the same on any device."""
         return torch.randn(*shape, generator=self.noise).to(self.device)
 
+    def rand(self, *shape: int) -> torch.Tensor:
+        """Uniform noise in 0..1, likewise."""
+        return torch.rand(*shape, generator=self.noise).to(self.device)
+
     def half(self) -> torch.autocast:
         """A context in which networks compute in half precision, where that is native."""
         return half_precision(self.device)

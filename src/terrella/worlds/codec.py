@@ -22,7 +22,7 @@ from ..space.matching import (
     source_shares,
 )
 from ..space.mosaic import read_mosaic
-from .generator import Block, Conditioning, down_and_up, encode_depth
+from .generator import Block, Conditioning, down_and_up, encode_depth, generate
 
 COARSE = 4  # side in pixels of the squares that the trunk sees; choices are made for each pixel
 PIXEL = 16  # features of each pixel from its square, and as many from its neighbours
@@ -144,6 +144,10 @@ class Codec(nn.Module):
             drawn = without_smears(drawn, seen)
         drawn = drawn.float() / 127.5 - 1
         return torch.cat([drawn, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
+
+    def draw(self, noise: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+        """See parts.Generator."""
+        return generate(self, noise, conditioning, 1)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """With `scroll`, the move by which most of the picture goes on, where there is a mosaic; and with what that mosaic then

@@ -28,6 +28,7 @@ from .checkpoint import WORLD_FILE, Tensors, data_file, read_about, read_data, w
 from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
+from .flow import FlowConfig, FlowNetwork
 from .frame_history import FrameHistory, StartClips
 from .generator import UNet
 from .keyframe_scene import KeyframeScene
@@ -280,7 +281,11 @@ def _frames(config: HistoryConfig, weights: Tensors, remembered: Tensors) -> Fra
 KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "body": {"motion": (MotionConfig, lambda config, weights, _: MotionBody(load_weights(Motion(config), weights)))},
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
-    "generator": {"unet": (GeneratorConfig, _network(UNet)), "codec": (CodecConfig, _network(Codec))},
+    "generator": {
+        "unet": (GeneratorConfig, _network(UNet)),
+        "codec": (CodecConfig, _network(Codec)),
+        "flow": (FlowConfig, _network(FlowNetwork)),
+    },
     "objects": {"billboards": (BillboardsConfig, _network(Billboards))},
     "outcome": {
         "constant": (ConstantConfig, lambda config, weights, _: ConstantOutcome(config)),
@@ -304,7 +309,7 @@ def _packed_frames(scene: FrameHistory, quality: int) -> dict[str, torch.Tensor]
     starts = _pack_frames(scene.starts.frames.flatten(0, 1), max(quality, 99))
     starts |= {name: getattr(scene.starts, name) for name in ("actions", "vitals", "known")}
     packed = {**{f"starts.{name}": value for name, value in starts.items()}, "over": scene.over}
-    if scene.config.fog_px:
+    if scene.grounded:
         data = zlib.compress(scene.ground.cpu().numpy().tobytes(), 9)
         packed["ground.bytes"] = torch.from_numpy(np.frombuffer(data, np.uint8).copy())
         packed["ground.size"] = torch.tensor(scene.ground.shape[1:])

@@ -69,11 +69,13 @@ class FrameHistory:
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
         self.ground = torch.zeros(4, 1, 1, dtype=torch.uint8, device=self.device) if ground is None else ground
+        self.grounded = len(self.moves) > 1 and self.ground[0].numel() > 1
         flat = ("mosaic", "scroll") if config.moves else ()
         self.drawn_names: tuple[str, ...] = (
             "frames",
             *flat,
-            *(("known", "place", "observed") if config.fog_px else ()),
+            *(("place",) if self.grounded else ()),
+            *(("known", "observed") if config.fog_px else ()),
         )
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
@@ -126,10 +128,11 @@ class FrameHistory:
             elif prior is None:
                 seen["mosaic"] = empty_mosaic(evidence.batch, self.config.size, self.device)
             seen["scroll"] = scroll_index(frames[:, 1], frames[:, 0], self.moves)
-        if self.config.fog_px:
+        if self.grounded:
             shown = ~self.over.expand(len(frames), -1, -1)
             place, share = locate(frames[:, 0], shown, self.ground)
             seen["place"] = torch.where(share[:, None] >= ALIKE, place, self._followed(prior, seen["scroll"]))
+        if self.config.fog_px:
             seen["known"] = torch.full_like(frames[:, 0, 0], 255)
             seen["observed"] = torch.ones(len(frames), dtype=torch.bool, device=self.device)
         return State(seen) if prior is None else prior.replace(**seen)
@@ -166,9 +169,12 @@ class FrameHistory:
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
+        if mosaic is not None and scroll is None:
+            scroll = scroll_index(newest_frame(state), frame.rgb, self.moves)
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
-        if self.config.fog_px and scroll is not None:
+        if self.grounded and scroll is not None:
             flat["place"] = state["place"] - self.moves[scroll]
+        if self.config.fog_px and scroll is not None:
             flat["known"] = (conditioning.glimpse.known * 255).to(torch.uint8)
             flat["observed"] = torch.zeros_like(state["observed"])
         return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
@@ -179,12 +185,15 @@ class FrameHistory:
         frames alone, and what it lacks from the ground."""
         frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
         whole = update_mosaic(state["mosaic"], frame, move, self.over)
-        if not self.config.fog_px:
+        if not self.grounded:
             return whole
+        at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
+        ground = window(self.ground, at, (whole.shape[2], whole.shape[3]))
+        if not self.config.fog_px:
+            return torch.where(ground[:, 3:] > 0, ground, whole)
         unchanged = update_mosaic(state["mosaic"], frame, move, torch.ones_like(self.over))
         whole = torch.where(state["observed"].view(-1, 1, 1, 1), whole, unchanged)
-        at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
-        return torch.where(whole[:, 3:] > 0, whole, window(self.ground, at, (whole.shape[2], whole.shape[3])))
+        return torch.where(whole[:, 3:] > 0, whole, ground)
 
     def _whole(self, state: State) -> torch.Tensor:
         """The mosaic; where it is empty, what lies over it."""

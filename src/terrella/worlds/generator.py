@@ -129,6 +129,10 @@ class UNet(nn.Module):
         """The same: it derives nothing from it."""
         return conditioning
 
+    def draw(self, noise: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+        """See parts.Generator."""
+        return generate(self, noise, conditioning, self.config.steps)
+
     def forward(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
         """noisy [B, 4, H, W] = rgb in [-1, 1] and depth code; time [B]. Returns the clean frame in the same code; where things
         move, with a fifth plane, the logit of a thing."""

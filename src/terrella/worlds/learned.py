@@ -26,7 +26,7 @@ from .body import NoBody
 from .config import VideoConfig
 from .controls import Controls
 from .frame_history import StartClips
-from .generator import Conditioning, channels_last, decode, generate
+from .generator import Conditioning, channels_last, decode
 from .localisation import NoEstimator
 from .objects import NoObjects
 from .outcome import ConstantConfig, ConstantOutcome
@@ -109,7 +109,7 @@ class LearnedWorld:
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
         for name in ("moves", "fog_px"):  # of a codec, found in its recording
             settings.pop(name, None)
-        settings |= {name: getattr(drawn, name) for name in ("channels", "steps", "residual")}
+        settings |= {"channels": drawn.channels, "steps": drawn.steps, "residual": getattr(drawn, "residual", False)}
         if self.body:
             settings |= {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}
         settings |= {"vitals": self.outcome.begins, "actions": self.controls.numbers}
@@ -296,7 +296,7 @@ class LearnedWorld:
 
     def _generated(self, conditioning: Conditioning, seeds: torch.Tensor) -> torch.Tensor:
         noise = chance.normal(seeds, (4, *self.size), stream=NOISE)
-        return generate(self.generator, noise, conditioning, self.generator.config.steps)
+        return self.generator.draw(noise, conditioning)
 
     def _judged(self, state: State, lone: torch.Tensor, seeds: torch.Tensor) -> State:
         """`state`, of pictures that came alone, with the error to expect, judged by what the world would draw there; `lone` [B]:

@@ -130,14 +130,14 @@ class Scene(WorldPart, Protocol):
 
 @runtime_checkable
 class Generator(WorldPart, Protocol):
-    """Draws a frame: a UNet by flow matching (config.steps: Euler steps a frame), or the Codec in one pass."""
+    """Draws a frame: a UNet or a FlowNetwork by flow matching in config.steps steps, or the Codec in one pass."""
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """The conditioning, with what the generator itself derives from it once a frame."""
 
-    def __call__(self, noisy: torch.Tensor, time: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
-        """The clean frame [B, 4 or 5, H, W]: rgb in [-1, 1], depth code, and where things move the logit of a thing; of `noisy`
-        [B, 4, H, W] at flow time [B] in 0..1."""
+    def draw(self, noise: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
+        """The clean frame [B, 4 or 5, H, W]: rgb in [-1, 1], depth code, and where things move the logit of a thing; by chance from
+        `noise` [B, 4, H, W]."""
 
 
 @runtime_checkable

@@ -53,10 +53,11 @@ class Spans:
         return self.past + self.slots + self.rollout
 
     @staticmethod
-    def fitting(lengths: np.ndarray, slots: int) -> Spans:
-        """The longest for which episodes of these lengths have rows enough; DatasetError if all are too short."""
+    def fitting(lengths: np.ndarray, slots: int, past: int = PAST, rollout: int = ROLLOUT) -> Spans:
+        """The longest up to `past` and `rollout` for which episodes of these lengths have rows enough; DatasetError if all are too
+        short."""
         rows = lambda past, rollout: lengths[lengths >= past + slots + rollout].sum()  # noqa: E731
-        rollouts, pasts = (ROLLOUT, ROLLOUT // 2, ROLLOUT // 4), (PAST, PAST // 2, 0)
+        rollouts, pasts = (rollout, rollout // 2, max(1, rollout // 4)), (past, past // 2, 0)
         if not rows(0, rollouts[-1]):
             raise DatasetError(f"no episode has the {slots + rollouts[-1]} rows that a clip has; record longer ones.")
         rollout = next(steps for steps in rollouts if rows(0, steps) >= 0.5 * rows(0, rollouts[-1]))

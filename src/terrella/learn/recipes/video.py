@@ -21,12 +21,13 @@ from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
-from .video_flat import CodecRecipe, FlatFlowRecipe
+from .video_flat import CodecRecipe, FlatFlowRecipe, FlowRecipe
 from .video_parts import VideoRecipe
 from .video_posed import PosedRecipe
 
 FEWEST_FRAMES = 200  # from which an uncertainty is learned
 TUNING = 0.06  # the part of the hours that tuning may take
+FLAT = {"codec": CodecRecipe, "flow": FlowRecipe}
 WHY = "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
 
 
@@ -82,7 +83,7 @@ def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Repo
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
-    make = PosedRecipe if video.geometry else CodecRecipe if config.flow_steps == 1 else FlatFlowRecipe
+    make = PosedRecipe if video.geometry else FLAT[config.generator] if config.flow_steps == 1 else FlatFlowRecipe
     return make(run, recording, config, video)
 
 

@@ -1,6 +1,7 @@
 """Settings of `train video`, and the kind of world that a recording allows."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from ...core.errors import DatasetError
 from ...worlds.config import VideoConfig
@@ -22,6 +23,8 @@ class TrainConfig:
     # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88 128, and
     # without depth 48 64 96.
     channels: tuple[int, ...] = ()
+    # How a world without geometry is drawn: codec fetches and paints pixels, flow draws samples of frames by a U-Net.
+    generator: Literal["codec", "flow"] = "codec"
     frames: int = 4  # Number of past frames that a world without geometry sees.
     # Training steps of the model that predicts reward, termination and vitals.
     outcome_steps: int = 1500

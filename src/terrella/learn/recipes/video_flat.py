@@ -9,17 +9,22 @@ import torch
 import torch.nn.functional as F
 
 from ...core.errors import DatasetError, TrainingError
+from ...space.ground import joined
+from ...space.matching import scroll_index
 from ...space.mosaic import read_mosaic
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
+from ...worlds.controls import Controls
+from ...worlds.flow import FlowConfig, FlowNetwork
 from ...worlds.frame_history import FrameHistory, StartClips
 from ...worlds.learned import LearnedWorld
 from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
-from ..feeds import codec_feed, frames_feed
-from ..moves import CodecStatistics, frequent_moves, mosaics, overlay, palette
+from ..feeds import codec_feed, flow_feed, frames_feed
+from ..moves import CodecStatistics, frequent_moves, mosaics, overlay, palette, stitch_episodes
 from ..objectives.codec import CodecObjective, Spans
 from ..objectives.flow import Flow
+from ..objectives.flow_frames import FlowClipMaker, FlowFrames
 from ..objectives.fog import CLIPS as FOG_CLIPS
 from ..objectives.fog import choose_fog
 from ..objectives.scroll import learn_scroll
@@ -34,6 +39,8 @@ from .video_parts import VideoParts, flow_objective
 MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
 QUARTER = 0.25
+SCROLLS = 0.01  # see `scrolls_of`
+FLOW_ROLLOUT = 3  # steps of a clip that a flow network predicts
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE, MAX_STRESS = (
     0.4,
@@ -56,22 +63,16 @@ class CodecRecipe:
 
     def _objective(self) -> CodecObjective:
         """With the vocabulary of moves and colours of the recording, which the run's folder keeps."""
-        run, config, recording = self.parts.run, self.parts.config, self.parts.recording
+        config, recording = self.parts.config, self.parts.recording
         plain = self.video.generator
-        statistics = CodecStatistics.read(run.out, run.recipe)
-        if statistics is None or statistics.over.shape != plain.size:
-            pixels = int(PAIR_PIXELS * min(1.0, max(config.hours / QUARTER, 1 / 16)))
-            statistics = codec_statistics(recording, config.seed, pixels)
-            statistics.write(run.out, run.recipe)
+        statistics = _statistics_of(self.parts)
         sizes = len(statistics.moves), len(statistics.palette)
         settings = CodecConfig(plain.size, plain.slots, plain.context, *sizes)
         levels = int(np.log2(min(plain.size) // COARSE)) + 1  # as many as a small frame has room for
         codec = Codec(replace(settings, channels=(config.channels or settings.channels)[:levels]))
         codec.moves[1:], codec.palette[:] = statistics.moves, statistics.palette
         codec.stress.fill_(statistics.stress**USUAL)
-        ranges = recording.cache.episodes
-        lengths = np.array([np.diff(ranges[number])[0] for number in recording.seen] or [0])
-        spans = Spans.fitting(lengths, self.video.slots)
+        spans = Spans.fitting(_lengths(recording), self.video.slots)
         return CodecObjective(codec, config.learning_rate or 2e-3, spans, statistics.stress, statistics.over)
 
     def feed(self, batch: int) -> Feed:
@@ -115,6 +116,52 @@ class CodecRecipe:
         return {"taken_back": power, "fog_px": self.fog_px}
 
 
+class FlowRecipe:
+    """A flow network: each frame is a sample of what may follow the last frames, with the mosaic as memory where pictures
+    scroll."""
+
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+        self.parts = _flat_parts(run, recording, config, video)
+        self.video = self.parts.video
+        statistics = _statistics_of(self.parts)
+        moves, self.over = scrolls_of(recording, statistics, config.seed), statistics.over
+        plain = self.video.generator
+        widths = config.channels or FlowConfig.channels
+        settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths)
+        network = FlowNetwork(settings)
+        network.moves[:] = moves
+        spans = Spans.fitting(_lengths(recording), self.video.slots, 0, FLOW_ROLLOUT)
+        self.objective = FlowFrames(network, config.learning_rate or 1.2e-3, spans, statistics.stress)
+        self.stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
+        self.ground = None if self.stitched is None else joined(list(self.stitched.grounds.values()))
+        self.starts: StartClips | None = None  # made once
+
+    def feed(self, batch: int) -> Feed:
+        recording, slots = self.parts.recording, self.video.slots
+        controls = recording.controls or Controls.buttons(self.video.actions)
+        maker = FlowClipMaker(controls, slots, 2 * batch, self.stitched, self.over)
+        return flow_feed(recording, self.video, self.objective.spans, maker, self.parts.config.seed)
+
+    def preparations(self) -> list[Stage]:
+        return self.parts.outcome_stages()
+
+    def world(self, trainer: Trainer) -> LearnedWorld:
+        moves = self.objective.generator.moves.cpu()
+        if self.starts is None:
+            self.starts, rows = _starts(self.parts), _start_rows(self.parts)
+            if len(moves) > 1:
+                self.starts = replace(self.starts, known=_mosaics_before(self.parts, rows, moves, self.over))
+        whole = tuple((int(x), int(y)) for x, y in moves) if len(moves) > 1 else ()
+        scene = FrameHistory(replace(self.video.frames, moves=whole), self.starts, self.over, self.ground)
+        return _flat_world(self.parts, trainer, self.objective, scene)
+
+    def tuning_s(self, world: LearnedWorld) -> float:
+        return 0.0
+
+    def tune(self, world: LearnedWorld, share: float) -> dict:
+        return {}
+
+
 class FlatFlowRecipe:
     """A flow of several steps a frame: the teacher of a world of frames alone."""
 
@@ -150,7 +197,7 @@ def _flat_parts(run: Run, recording: Recording, config: TrainConfig, video: Vide
 
 
 def _flat_world(
-    parts: VideoParts, trainer: Trainer, objective: Flow | CodecObjective, scene: FrameHistory
+    parts: VideoParts, trainer: Trainer, objective: Flow | CodecObjective | FlowFrames, scene: FrameHistory
 ) -> LearnedWorld:
     return LearnedWorld(
         parts.about(trainer, (objective.generator,), 0),
@@ -158,6 +205,35 @@ def _flat_world(
         generator=copy.deepcopy(objective.smooth.module).cpu().float(),
         outcome=parts.trained_outcome(ConstantConfig(parts.median_reward)),
     )
+
+
+def _lengths(recording: Recording) -> np.ndarray:
+    """Rows of the episodes for training."""
+    ranges = recording.cache.episodes
+    return np.array([np.diff(ranges[number])[0] for number in recording.seen] or [0])
+
+
+def _statistics_of(parts: VideoParts) -> CodecStatistics:
+    """The statistics of the recording, which the run's folder keeps."""
+    run, config = parts.run, parts.config
+    statistics = CodecStatistics.read(run.out, run.recipe)
+    if statistics is None or statistics.over.shape != parts.video.size:
+        pixels = int(PAIR_PIXELS * min(1.0, max(config.hours / QUARTER, 1 / 16)))
+        statistics = codec_statistics(parts.recording, config.seed, pixels)
+        statistics.write(run.out, run.recipe)
+    return statistics
+
+
+def scrolls_of(recording: Recording, statistics: CodecStatistics, seed: int) -> torch.Tensor:
+    """The moves by which whole pictures scroll, int64 [n, 2], (0, 0) first: those that lead from SCROLLS of the pictures or more
+    to the next."""
+    rows = recording.rows_within(1, 0)
+    rows = np.sort(np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False))
+    moves = F.pad(statistics.moves, (0, 0, 1, 0))
+    count = torch.bincount(scroll_index(recording.rgb(rows - 1), recording.rgb(rows), moves), minlength=len(moves))
+    often = count >= SCROLLS * len(rows)
+    often[0] = True
+    return moves[often]
 
 
 def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS) -> CodecStatistics:

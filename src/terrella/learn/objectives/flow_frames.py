@@ -1,0 +1,144 @@
+"""Flow of frames: a FlowNetwork learns the next frame from recorded frames and from frames of its own, by flow matching."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ...worlds.controls import Controls
+from ...worlds.flow import FlowNetwork
+from ...worlds.frame_history import glimpse_of_frames
+from ...worlds.generator import Conditioning, channels_last, context_thumbnail, pixels
+from ..moves import StitchedEpisodes
+from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
+from .codec import Spans
+
+NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
+CHANGED = 8  # differences of 255 by which a pixel changes
+DRAFTS = 0.4  # the part of the training that learns drafts alone
+LATEST = 0.9  # the largest flow time in training
+# Parts of the clips that see no memory, and all of it; the others see what the last frame showed.
+BLIND, WHOLE = 0.4, 0.3
+RECORDED = 400  # gradient steps on recorded frames alone, before rollouts begin
+LONE = 0.1  # the part of clips whose history is one frame repeated: play begins so, too
+
+
+@dataclass(frozen=True)
+class FlowClips:
+    """frames uint8 [B, slots + rollout, 3, H, W] and encoded actions [B, slots + rollout, A], action t leading from frame t to the
+    next; the oldest first. memory uint8 [B, rollout, 4, H, W]: what is known of the frames after the history, colour and votes;
+    None in a world that does not scroll."""
+
+    frames: torch.Tensor
+    actions: torch.Tensor
+    memory: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class FlowClipMaker:
+    """Makes batches of `batch` clips on the CPU, preferring those that change more. over: bool [H, W], what does not scroll."""
+
+    controls: Controls
+    slots: int
+    batch: int
+    stitched: StitchedEpisodes | None
+    over: torch.Tensor
+
+    def __call__(self, clips: Mapping[str, np.ndarray], now: TrainStep) -> FlowClips:
+        """From clips (rgb uint8 [N, T, H, W, 3], action [N, T, ...], row [N, T])."""
+        rgb, action = np.asarray(clips["rgb"]), np.asarray(clips["action"], np.float32)
+        one, other = rgb[:, self.slots - 1 : -1], rgb[:, self.slots :]
+        differs = ((np.maximum(one, other) - np.minimum(one, other)).max(-1) > 8).mean((2, 3)).max(1)
+        weight = 0.2 + 1.0 * (differs > 0.005) + 2.0 * (differs > 0.2)
+        picks = now.rng.choice(len(rgb), self.batch, replace=len(rgb) < self.batch, p=weight / weight.sum())
+        picks = now.rng.permutation(picks)
+        frames = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
+        actions = self.controls.encode(torch.from_numpy(action[picks]).flatten(0, 1)).unflatten(0, (self.batch, -1))
+        lone = torch.from_numpy(now.rng.random(self.batch) < LONE)
+        frames[lone, : self.slots - 1] = frames[lone, self.slots - 1 : self.slots]
+        actions[lone, : self.slots - 1] = 0
+        return FlowClips(frames, actions, self._memory(np.asarray(clips["row"])[picks, self.slots :], now))
+
+    def _memory(self, rows: np.ndarray, now: TrainStep) -> torch.Tensor | None:
+        """Of rows [B, rollout]."""
+        if self.stitched is None:
+            return None
+        size, place = (self.over.shape[0], self.over.shape[1]), self.stitched.place
+        after = torch.from_numpy(rows)
+        known = self.stitched.memory(after.flatten(), size).unflatten(0, after.shape)
+        move = place[after - 1] - place[after]
+        x = torch.arange(size[1]) - move[..., :1]
+        y = torch.arange(size[0]) - move[..., 1:]
+        shown = ((x >= 0) & (x < size[1]))[:, :, None] & ((y >= 0) & (y < size[0]))[..., None]  # by the last frame
+        kind = torch.from_numpy(now.rng.random(len(rows)))[:, None, None, None]
+        seen = ~self.over & (kind >= BLIND) & (shown | (kind < BLIND + WHOLE))
+        return known * seen[:, :, None]
+
+
+class FlowFrames:
+    """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise or memory, and later
+    also at a random t with memory. stress: the additional weight of pixels that change."""
+
+    def __init__(self, network: FlowNetwork, learning_rate: float, spans: Spans, stress: float):
+        self.stress, self.spans, self.losses_per_batch = stress, spans, spans.rollout  # gradient steps per batch
+        self.generator = channels_last(network)
+        self.smooth = Ema(self.generator, 0.995)
+        self.modules = {"generator": self.generator, "smooth": self.smooth}
+        rate = warmup_cosine(learning_rate, 100, 0.02)
+        self.learners = {"generator": adamw((self.generator,), rate, 1e-3, (0.9, 0.98), self.smooth)}
+
+    def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
+        slots = self.generator.config.slots
+        recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
+        shown = recorded[:, :slots].flip(1)
+        half = len(recorded) // 2 * (now.step * self.losses_per_batch >= RECORDED)  # the other half stays recorded
+        for step in range(slots, recorded.shape[1]):
+            truth, before = recorded[:, step], recorded[:, step - 1]
+            context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
+            memory = None if batch.memory is None else batch.memory[:, step - slots].to(now.device)
+            yield self._loss(shown, context, memory, truth, before, now)
+            count = half if step + 1 < recorded.shape[1] else 0
+            drawn = self._drawn(shown[:count], context[:count], now) if count else truth[:0]
+            shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
+
+    def _loss(self, shown, context, memory, truth, before, now: TrainStep) -> Loss:
+        """The loss of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
+        batch, network = len(truth), self.generator
+        clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
+        level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
+        frames = frames + level * now.randn(*frames.shape)
+        changes = (truth.int() - before.int()).abs().amax(1, keepdim=True) > CHANGED
+        weight = 1 + self.stress * changes.float()
+        weight = weight / weight.mean()
+        with now.half():
+            seen = network.encode(frames, context)
+            draft = network.clean(seen, seen.last, torch.zeros(batch, device=now.device), None)
+        parts = {"draft": _error(draft - clean, weight)}
+        if now.share < DRAFTS:
+            return Loss("generator", parts["draft"], parts)
+        t = LATEST * now.rand(batch)
+        share = t[:, None, None, None]
+        noisy = (1 - share) * now.randn(*clean.shape) + share * clean
+        with now.half():
+            drawn = network.clean(seen, noisy, t, memory)
+        parts["drawn"] = _error(drawn - clean, weight)
+        return Loss("generator", parts["draft"] + parts["drawn"], parts)
+
+    @torch.no_grad()
+    def _drawn(self, shown, context, now: TrainStep) -> torch.Tensor:
+        """Frames uint8 [B, 3, H, W] that follow those `shown`, by the averaged weights, without memory, in 1 step or more."""
+        network = self.smooth.module
+        steps = 1 + int(now.rng.integers(network.config.steps)) * (now.share > DRAFTS)
+        noise = now.randn(len(shown), 4, *network.config.size)
+        glimpse = glimpse_of_frames(shown)
+        with now.half():
+            clean = network.draw(noise, Conditioning(glimpse, noise, context), steps)
+        return pixels(clean.float())
+
+
+def _error(away: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """The weighted mean of absolute and squared errors [B, 3, H, W]."""
+    return (weight * (away.abs() + away.square())).mean()
