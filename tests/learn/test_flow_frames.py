@@ -1,0 +1,122 @@
+"""Flow of frames: its memory is what the recording's other frames show, and it learns what moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.data.layouts import layout_of
+from tests.learn.small import BARE
+from tests.learn.stopping import quiet, resumes_exactly
+
+from terrella.core import check_world, make_rng
+from terrella.data import Recorder
+from terrella.learn.moves import stitch_episodes
+from terrella.learn.objectives.codec import Spans
+from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
+from terrella.learn.recipes.video import train_video
+from terrella.learn.recording import Recording
+from terrella.learn.trainer import TrainStep
+from terrella.worlds.controls import Controls
+from terrella.worlds.flow import FlowConfig, FlowNetwork
+from terrella.worlds.folder import load_world
+
+SIZE, FLAT = (24, 32), replace(BARE, geometry=False, generator="flow", steps=12)
+MOVES = torch.tensor([[0, 0], [-2, 0], [2, 0]])
+
+
+def step(share: float = 0.0, number: int = 0) -> TrainStep:
+    return TrainStep(number, share, torch.device("cpu"), np.random.default_rng(number), make_rng(number))
+
+
+@pytest.fixture(scope="module")
+def scrolling(tmp_path_factory):
+    """A recording of a wide picture, seen through a window that goes right and back: two pixels a step."""
+    wide = np.random.default_rng(0).integers(0, 256, (SIZE[0] // 6, 20, 3), dtype=np.uint8).repeat(6, 0).repeat(6, 1)
+    folder = tmp_path_factory.mktemp("scrolling") / "set"
+    with Recorder(folder, layout_of(10.0, ("right",), rgb=SIZE)) as recorder:
+        for _ in range(3):
+            for row in range(81):  # edges at odd columns, which the estimate of the scroll looks at
+                x = 1 + 2 * (row if row <= 40 else 80 - row)
+                recorder.add({"rgb": wide[:, x : x + SIZE[1]]}, np.array([row < 40]) if row < 80 else None, 0.0, False)
+            recorder.end_episode()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recording(scrolling):
+    return Recording.open(scrolling, SIZE, quiet)
+
+
+def test_the_memory_of_a_row_is_its_own_picture(recording):
+    stitched = stitch_episodes(recording, MOVES, torch.zeros(SIZE, dtype=torch.bool))
+    rows = torch.tensor([0, 7, 40, 77])
+    known = stitched.memory(rows, SIZE)
+    off = (known[:, :3].float() - recording.rgb(rows.numpy()).float()).abs()
+    assert (known[:, 3] > 0).all() and off.mean() < 4 and off.mean((1, 2, 3)).max() < 8, "but for the video's noise"
+    unseen = recording.cache.episodes[recording.held_out[0]][0] if recording.held_out else None
+    if unseen is not None:
+        assert not stitched.memory(torch.tensor([unseen]), SIZE).any()
+
+
+def test_some_clips_see_no_memory_some_all_and_some_what_the_last_frame_showed(recording):
+    stitched = stitch_episodes(recording, MOVES, torch.zeros(SIZE, dtype=torch.bool))
+    over = torch.zeros(SIZE, dtype=torch.bool)
+    over[:2] = True
+    rows = np.tile(np.arange(10, 17), (60, 1))
+    clips = {"rgb": recording.rgb(rows.ravel()).unflatten(0, rows.shape).permute(0, 1, 3, 4, 2).numpy()}
+    clips |= {"action": np.ones((60, 7, 1), np.float32), "row": rows}
+    made = FlowClipMaker(Controls.buttons(1), 4, 60, stitched, over)(clips, step())
+    assert made.memory is not None and made.memory.shape == (60, 3, 4, *SIZE)
+    seen = (made.memory[:, 0, 3] > 0).float().mean((1, 2))
+    shares = [(seen == 0).float().mean(), ((seen - 22 / 24).abs() < 1e-3).float().mean()]
+    assert abs(shares[0] - BLIND) < 0.2 and abs(shares[1] - WHOLE) < 0.2 and sum(shares) < 1
+    part = made.memory[(seen > 0) & (seen < 0.9), 0, 3]
+    assert not part[..., -2:].any() and (part[:, 2:, :-2] > 0).all(), "the two columns that enter are new"
+
+
+def learned(share: float) -> list[float]:
+    """Losses of drafts of a dot that moves by two pixels, before and after 40 gradient steps."""
+    torch.manual_seed(0)
+    network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
+    objective, losses = FlowFrames(network, 5e-3, Spans(0, 2, 1), 4.0), []
+    frames = torch.zeros(8, 3, 3, 16, 16, dtype=torch.uint8)
+    for row in range(3):
+        for entry in range(8):
+            frames[entry, row, :, 4 + entry, 2 + 2 * row : 5 + 2 * row] = 255
+    optimiser = objective.learners["generator"].optimiser
+    for number in range(40):
+        for loss in objective.losses(FlowClips(frames, torch.zeros(8, 3, 1), None), step(share, number)):
+            optimiser.zero_grad()
+            loss.value.backward()
+            optimiser.step()
+            losses.append(float(loss.parts["draft"].detach()))
+            assert set(loss.parts) == ({"draft"} if share < DRAFTS else {"draft", "drawn"})
+    return losses
+
+
+@pytest.mark.parametrize("share", [0.0, 0.9])
+def test_it_learns_what_moves(share):
+    losses = learned(share)
+    assert losses[-1] < 0.3 * losses[0]
+
+
+@pytest.fixture(scope="module")
+def flow_run(scrolling, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    return out, train_video(scrolling, out, FLAT, quiet)
+
+
+def test_a_world_of_a_scrolling_recording_knows_its_ground(flow_run):
+    out, facts = flow_run
+    world = load_world(out / "world")
+    assert facts["step"] == 12 and world.generator.kind == "flow"
+    assert [-2, 0] in world.generator.moves.tolist() and [2, 0] in world.generator.moves.tolist()
+    assert (world.scene.ground[3] > 0).float().mean() > 0.9 and world.scene.ground.shape[2] >= 110
+    assert "batches" in check_world(world)
+
+
+def test_a_stopped_run_goes_on_exactly(flow_run, scrolling, tmp_path):
+    resumes_exactly(lambda out: train_video(scrolling, out, FLAT, quiet), flow_run[0], tmp_path, {"flow": 1})

@@ -1,0 +1,125 @@
+"""FlowNetwork: untrained it keeps the last frame, chance decides between its drawing steps, and memory follows the draft's scroll."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from terrella.core import check_world, make_rng
+from terrella.space.ground import window
+from terrella.space.mosaic import empty_mosaic, update_mosaic
+from terrella.worlds.config import HistoryConfig
+from terrella.worlds.controls import Controls
+from terrella.worlds.flow import STAYS, FlowConfig, FlowNetwork
+from terrella.worlds.folder import load_world, save_world
+from terrella.worlds.frame_history import FrameHistory, StartClips, glimpse_of_frames
+from terrella.worlds.generator import Conditioning, pixels
+from terrella.worlds.learned import About, LearnedWorld
+
+SIZE, SLOTS = (20, 28), 3  # sides that are no multiples of 16
+MOVES = torch.tensor([[0, 0], [2, 0], [0, -3]])
+
+
+def network(wild: bool = True, moves: int = 2, seed: int = 0) -> FlowNetwork:
+    torch.manual_seed(seed)
+    made = FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + 2 * SLOTS, moves, (8, 16, 16))).eval().requires_grad_(False)
+    made.moves[:] = MOVES[: moves + 1]
+    if wild:
+        torch.nn.init.normal_(made.output.weight, std=0.3)
+        for block in (*made.before, *made.after, made.drawn):
+            torch.nn.init.normal_(block.second.weight, std=0.1)
+    return made
+
+
+def pictures(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.randint(0, 256, (*shape, 3, *SIZE), dtype=torch.uint8, generator=make_rng(seed))
+
+
+def shown(batch: int, **more) -> Conditioning:
+    context = torch.randn(batch, 36 + 2 * SLOTS, generator=make_rng(1))
+    return Conditioning(glimpse_of_frames(pictures(batch, SLOTS)), torch.zeros(batch, 4, *SIZE), context, **more)
+
+
+def noise(batch: int, seed: int) -> torch.Tensor:
+    return torch.randn(batch, 4, *SIZE, generator=make_rng(seed))
+
+
+def world(generator: FlowNetwork, ground: torch.Tensor | None = None) -> LearnedWorld:
+    starts = StartClips.of(pictures(4, SLOTS), 2)
+    if ground is not None:
+        frames = torch.stack([ground[:3, y : y + SIZE[0], x : x + SIZE[1]] for x, y in [(0, 0), (12, 6), (30, 18)]])
+        starts = StartClips.of(frames[:, None].repeat(1, SLOTS, 1, 1, 1), 2)
+    moves = tuple(map(tuple, generator.moves.tolist())) if generator.config.moves else ()
+    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2, moves), starts, None, ground)
+    return LearnedWorld(About("made", Controls.buttons(2), 0.1), scene=scene, generator=generator)
+
+
+@pytest.mark.parametrize("moves", [0, 2])
+def test_it_keeps_the_contract(moves):
+    assert {"batches", "states_can_be_saved"} <= set(check_world(world(network(moves=moves)), steps=3))
+
+
+def test_untrained_the_last_frame_stays_to_the_last_bit():
+    given = shown(2)
+    drawn = network(wild=False).draw(noise(2, 0), given)
+    assert torch.equal(pixels(drawn), pictures(2, SLOTS)[:, 0])
+
+
+@pytest.mark.parametrize(("by", "stays"), [(0.9 * STAYS, True), (2 * STAYS, False)])
+def test_a_change_too_small_to_see_is_no_change(by, stays):
+    made = network(wild=False)
+    made.output.bias += by
+    after = pixels(made.draw(noise(1, 0), shown(1)))
+    before = pictures(1, SLOTS)[:, 0]
+    assert torch.equal(after, before) if stays else (after > before).float().mean() > 0.9
+
+
+def test_the_draft_is_the_same_whatever_the_noise_and_a_sample_is_not():
+    made, given = network(), shown(2)
+    drafts = [made.draw(noise(2, seed), given, steps=1) for seed in (0, 1)]
+    samples = [made.draw(noise(2, seed), given) for seed in (0, 1)]
+    assert torch.equal(*drafts) and not torch.allclose(*samples, atol=0.01)
+
+
+def test_each_of_a_batch_is_drawn_alone():
+    made, given, chance = network(), shown(18), noise(18, 0)
+    whole = made.draw(chance, given)
+    torch.testing.assert_close(whole[17:], made.draw(chance[17:], given.at(slice(17, 18))), rtol=1e-4, atol=1e-4)
+
+
+def test_memory_follows_the_scroll_of_the_draft_and_leaves_out_what_lies_over_it():
+    wide = torch.randint(0, 256, (1, 3, SIZE[0], SIZE[1] + 2), dtype=torch.uint8, generator=make_rng(2))
+    right, left = wide[..., 2:], wide[..., :-2]  # the picture scrolls by 2 to the right: what enters is 2 pixels of the left
+    still, none = torch.zeros(1, 2, dtype=torch.int64), torch.zeros(SIZE, dtype=torch.bool)
+    mosaic = update_mosaic(empty_mosaic(1, SIZE), left, still, none)
+    mosaic = update_mosaic(mosaic, right, -MOVES[1:2], none)
+    over = torch.zeros(1, *SIZE, dtype=torch.bool)
+    over[:, :4] = True
+    known = network().recall(right, left, mosaic, over)
+    assert torch.equal(known[:, :3, 4:], left[..., 4:, :]) and (known[:, 3, 4:] > 0).all()
+    assert not known[:, :, :4].any()
+
+
+def test_it_is_loaded_as_it_was_saved(tmp_path):
+    ground = torch.randint(0, 256, (4, 48, 64), dtype=torch.uint8, generator=make_rng(3)).clamp_min(1)
+    made = world(network(), ground)
+    save_world(made, tmp_path / "world")
+    loaded = load_world(tmp_path / "world")
+    assert loaded.generator.config == made.generator.config and torch.equal(loaded.scene.ground, ground)
+    frames = []
+    for one in (made, loaded):
+        state = one.observe({"rgb": pictures(2).permute(0, 2, 3, 1)}, None, make_rng(0))
+        state = one.imagine(state, torch.tensor([[1, 0], [0, 1]], dtype=torch.int8), make_rng(1))
+        frames.append(one.render(state, ("rgb",))["rgb"])
+    assert torch.equal(*frames)
+
+
+def test_the_ground_of_the_recordings_is_known_from_every_start():
+    ground = torch.randint(0, 256, (4, 48, 64), dtype=torch.uint8, generator=make_rng(3)).clamp_min(1)
+    made = world(network(wild=False), ground)
+    state = made.start(3, make_rng(0))
+    assert torch.equal(window(ground, state["place"], SIZE)[:, :3], state["frames"][:, 0])
+    mosaic = made.scene.look(state, state).mosaic
+    assert mosaic is not None
+    counts = (mosaic[:, 3] > 0).sum((1, 2))
+    assert (counts == ground.shape[1] * ground.shape[2]).all(), "all of it lies in the mosaic"
