@@ -1,4 +1,4 @@
-"""FlowNetwork: untrained it keeps the last frame, chance decides between its drawing steps, and memory follows the draft's scroll."""
+"""FlowNetwork: untrained it keeps the last frame, noise decides a sample, and memory follows the draft's scroll."""
 
 from __future__ import annotations
 
@@ -89,7 +89,10 @@ def test_each_of_a_batch_is_drawn_alone():
 
 def test_memory_follows_the_scroll_of_the_draft_and_leaves_out_what_lies_over_it():
     wide = torch.randint(0, 256, (1, 3, SIZE[0], SIZE[1] + 2), dtype=torch.uint8, generator=make_rng(2))
-    right, left = wide[..., 2:], wide[..., :-2]  # the picture scrolls by 2 to the right: what enters is 2 pixels of the left
+    right, left = (
+        wide[..., 2:],
+        wide[..., :-2],
+    )  # the picture scrolls by 2 to the right: what enters is 2 pixels of the left
     still, none = torch.zeros(1, 2, dtype=torch.int64), torch.zeros(SIZE, dtype=torch.bool)
     mosaic = update_mosaic(empty_mosaic(1, SIZE), left, still, none)
     mosaic = update_mosaic(mosaic, right, -MOVES[1:2], none)

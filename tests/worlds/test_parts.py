@@ -13,6 +13,7 @@ from terrella.worlds.body import FASTEST_M, NoBody
 from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
+from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import KINDS
 from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import Conditioning, DrawnFrame, UNet, decode
@@ -47,27 +48,30 @@ B, SIZE = 3, (16, 32)
 BUTTONS = Controls.buttons(3)
 
 
-def flat(codec: bool) -> LearnedWorld:
-    """A frames-only world whose pictures a U-Net or a codec draws."""
+def flat(kind: str) -> LearnedWorld:
+    """A frames-only world whose pictures a U-Net, a codec or a flow network draws."""
     torch.manual_seed(0)
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8), slots=3, geometry=False)
     frames = torch.randint(0, 256, (4, 3, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
-    if not codec:
+    if kind == "unet":
         scene, generator = FrameHistory(config.frames, StartClips.of(frames, 3)), UNet(config.generator)
         return LearnedWorld(About("flat", BUTTONS, 0.1), scene=scene, generator=generator)
     moves = ((0, 0), (1, 0), (0, 1))
     scene = FrameHistory(type(config.frames)(SIZE, 3, 3, moves), StartClips.of(frames, 3))
-    generator = Codec(CodecConfig(SIZE, 3, config.generator.context, len(moves) - 1, 8, (8, 8)))
+    known = SIZE, 3, config.generator.context, len(moves) - 1
+    flow = kind == "flow"
+    generator = FlowNetwork(FlowConfig(*known, (8, 8, 8))) if flow else Codec(CodecConfig(*known, 8, (8, 8)))
     generator.moves.copy_(torch.tensor(moves))
-    return LearnedWorld(About("codec", BUTTONS, 0.1), scene=scene, generator=generator)
+    return LearnedWorld(About(kind, BUTTONS, 0.1), scene=scene, generator=generator)
 
 
 WORLDS = {
     "still": lambda: place(BUTTONS),
     "moving": lambda: place(BUTTONS, moving=True),
     "things": lambda: place(BUTTONS, moving=True, objects=True),
-    "flat": lambda: flat(codec=False),
-    "codec": lambda: flat(codec=True),
+    "flat": lambda: flat("unet"),
+    "codec": lambda: flat("codec"),
+    "flow": lambda: flat("flow"),
 }
 PROTOCOLS = {"body": Body, "scene": Scene, "generator": Generator, "objects": Objects, "outcome": Outcome}
 
@@ -216,10 +220,10 @@ def test_a_generator_draws_by_its_noise(world):
     shown = world.generator.prepare(world.scene.look(after, before))
     planes = 5 if "things" in before else 4
     noise = torch.randn(B, 4, *SIZE, generator=make_rng(0))
-    clean = world.generator(noise, torch.zeros(B), shown)
+    clean = world.generator.draw(noise, shown)
     assert clean.shape == (B, planes, *SIZE) and world.generator.config.steps >= 1
-    assert torch.equal(clean, world.generator(noise, torch.zeros(B), shown))
-    one = world.generator(noise[1:2], torch.zeros(1), shown.at(slice(1, 2)))
+    assert torch.equal(clean, world.generator.draw(noise, shown))
+    one = world.generator.draw(noise[1:2], shown.at(slice(1, 2)))
     assert (one - clean[1:2]).abs().max() < 1e-4
     frame = decode(clean, posed=world.scene.camera is not None)
     assert frame.rgb.dtype == torch.uint8 and frame.rgb.shape == (B, 3, *SIZE)
@@ -283,7 +287,7 @@ def test_an_uncertainty_says_an_error_for_each_entry(made):
     assert isinstance(part, Uncertainty) and bool(part) == (made is not NoUncertainty)
     before, after, _ = walked(world)
     shown = world.look(after, before)
-    clean = world.generator(torch.randn(B, 4, *SIZE, generator=make_rng(0)), torch.zeros(B), shown)
+    clean = world.generator.draw(torch.randn(B, 4, *SIZE, generator=make_rng(0)), shown)
     gone = torch.tensor([[1.0, 0, 0, 0, 0], [400.0, 90, 20, 0, 0], [1.0, 0, 0, 1, 1]])
     whole, drifted, invented = part.expected(shown, clean, gone)
     for expected in (whole, drifted, invented):

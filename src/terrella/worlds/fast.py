@@ -21,8 +21,7 @@ from ..core import chance
 from ..core.errors import TerrellaError
 from ..core.world import make_rng
 from ..space.keyframes import Glimpse
-from .codec import Codec
-from .generator import Conditioning
+from .generator import Conditioning, UNet
 from .learned import LearnedWorld
 
 Forward = Callable[..., torch.Tensor]
@@ -50,10 +49,8 @@ def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     """The world with the faster of two ways of drawing, and which it is: eager torch, or ONNX Runtime on a CPU and a compiled
     graph on a GPU. Frames that need a gradient are drawn by eager torch. TerrellaError where ONNX Runtime is not installed."""
     generator: nn.Module = copy.deepcopy(world.generator)
-    if isinstance(generator, Codec):
-        raise TerrellaError(
-            "--fast is for worlds that a U-Net draws; this one fetches its pixels by compiled kernels already."
-        )
+    if not isinstance(generator, UNet):
+        raise TerrellaError("--fast is for worlds with depth and poses; play this one without it.")
     inputs = example_inputs(world)
     on_cpu = world.device.type == "cpu"
     began = time.perf_counter()

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from ...core.errors import TrainingError
-from ...worlds.codec import Codec
 from ...worlds.folder import save_world
+from ...worlds.generator import UNet
 from ...worlds.learned import LearnedWorld
 from ..feeds import RandomBatches
 from ..objectives.distillation import Student
@@ -95,7 +95,7 @@ def train_dreams(
     """
     if min(config.steps, config.horizon, config.batch) < 1:
         raise TrainingError("--steps, --horizon and --batch are 1 or more.")
-    if isinstance(world.generator, Codec):
+    if not isinstance(world.generator, UNet):
         raise TrainingError(
             f"{world.spec.name} was trained on its own rollouts already, as worlds without depth are: nothing is left to do here."
         )
