@@ -78,7 +78,7 @@ def test_some_clips_see_no_memory_some_all_and_some_what_the_last_frame_showed(r
 
 
 def learned(share: float) -> list[float]:
-    """Losses of drafts of a dot that moves by two pixels, before and after 40 gradient steps."""
+    """Losses of drafts of a dot that moves by two pixels, before and after 60 gradient steps."""
     torch.manual_seed(0)
     network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
     objective, losses = FlowFrames(network, 5e-3, Spans(0, 2, 1), 4.0), []
@@ -87,7 +87,7 @@ def learned(share: float) -> list[float]:
         for entry in range(8):
             frames[entry, row, :, 4 + entry, 2 + 2 * row : 5 + 2 * row] = 255
     optimiser = objective.learners["generator"].optimiser
-    for number in range(40):
+    for number in range(60):
         for loss in objective.losses(FlowClips(frames, torch.zeros(8, 3, 1), None), step(share, number)):
             optimiser.zero_grad()
             loss.value.backward()

@@ -47,7 +47,7 @@ Make = Callable[[Any, Tensors, Tensors], Any]
 # What reading a damaged folder may raise.
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
-HALVED = ("uncertainty", "estimator")  # parts whose weights are stored in half precision
+HALVED = ("uncertainty", "estimator")  # parts whose weights are stored in half precision, as those of a flow network are
 
 
 def save_world(
@@ -256,7 +256,7 @@ def _weights(name: str, part: Any) -> Tensors:
     network = part.motion if name == "body" and part else part
     if not isinstance(network, nn.Module):
         return {}
-    return half_weights(network) if name in HALVED else network.state_dict()
+    return half_weights(network) if name in HALVED or isinstance(network, FlowNetwork) else network.state_dict()
 
 
 def _places(config: KeyframesConfig, weights: Tensors, remembered: Tensors) -> KeyframeScene:

@@ -17,7 +17,7 @@ from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
 from .codec import Spans
 
 NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
-CHANGED = 8  # differences of 255 by which a pixel changes
+CHANGED = 8  # difference of 255 by which a pixel changes
 DRAFTS = 0.4  # the part of the training that learns drafts alone
 LATEST = 0.9  # the largest flow time in training
 # Parts of the clips that see no memory, and all of it; the others see what the last frame showed.
@@ -108,15 +108,14 @@ class FlowFrames:
         """The loss of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
         batch, network = len(truth), self.generator
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
+        last = frames[:, 0]
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
         frames = frames + level * now.randn(*frames.shape)
         changes = (truth.int() - before.int()).abs().amax(1, keepdim=True) > CHANGED
-        weight = 1 + self.stress * changes.float()
-        weight = weight / weight.mean()
         with now.half():
             seen = network.encode(frames, context)
             draft = network.clean(seen, seen.last, torch.zeros(batch, device=now.device), None)
-        parts = {"draft": _error(draft - clean, weight)}
+        parts = {"draft": self._error(draft, clean, last, changes)}
         if now.share < DRAFTS:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
@@ -124,8 +123,16 @@ class FlowFrames:
         noisy = (1 - share) * now.randn(*clean.shape) + share * clean
         with now.half():
             drawn = network.clean(seen, noisy, t, memory)
-        parts["drawn"] = _error(drawn - clean, weight)
+        parts["drawn"] = self._error(drawn, clean, last, changes)
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
+
+    def _error(self, drawn, clean, last, changes) -> torch.Tensor:
+        """The mean of absolute and squared errors [B, 3, H, W]. Pixels that change, in the recording (bool [B, 1, H, W]) or in what
+        is drawn, weigh more: otherwise a ball of two pixels would be ignored."""
+        changed = changes | ((drawn.detach() - last).abs().amax(1, keepdim=True) > CHANGED / 127.5)
+        weight = 1 + self.stress * changed.float()
+        away = drawn - clean
+        return (weight * (away.abs() + away.square())).mean() / (1 + self.stress * changes.float().mean())
 
     @torch.no_grad()
     def _drawn(self, shown, context, now: TrainStep) -> torch.Tensor:
@@ -137,8 +144,3 @@ class FlowFrames:
         with now.half():
             clean = network.draw(noise, Conditioning(glimpse, noise, context), steps)
         return pixels(clean.float())
-
-
-def _error(away: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """The weighted mean of absolute and squared errors [B, 3, H, W]."""
-    return (weight * (away.abs() + away.square())).mean()
