@@ -1,6 +1,8 @@
-"""FlowNetwork: untrained it keeps the last frame, noise decides a sample, and memory follows the draft's scroll."""
+"""FlowNetwork: untrained it keeps the last frame, noise decides a sample, and pictures are carried along."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 import torch
@@ -87,20 +89,32 @@ def test_each_of_a_batch_is_drawn_alone():
     torch.testing.assert_close(whole[17:], made.draw(chance[17:], given.at(slice(17, 18))), rtol=1e-4, atol=1e-4)
 
 
-def test_memory_follows_the_scroll_of_the_draft_and_leaves_out_what_lies_over_it():
+def scrolled() -> tuple[Conditioning, torch.Tensor, torch.Tensor]:
+    """A picture that is about to scroll by 2 to the right, a mosaic that knows what then enters, the next picture, and `over`."""
     wide = torch.randint(0, 256, (1, 3, SIZE[0], SIZE[1] + 2), dtype=torch.uint8, generator=make_rng(2))
-    right, left = (
-        wide[..., 2:],
-        wide[..., :-2],
-    )  # the picture scrolls by 2 to the right: what enters is 2 pixels of the left
+    last, after = wide[..., 2:], wide[..., :-2]
     still, none = torch.zeros(1, 2, dtype=torch.int64), torch.zeros(SIZE, dtype=torch.bool)
-    mosaic = update_mosaic(empty_mosaic(1, SIZE), left, still, none)
-    mosaic = update_mosaic(mosaic, right, -MOVES[1:2], none)
-    over = torch.zeros(1, *SIZE, dtype=torch.bool)
-    over[:, :4] = True
-    known = network().recall(right, left, mosaic, over)
-    assert torch.equal(known[:, :3, 4:], left[..., 4:, :]) and (known[:, 3, 4:] > 0).all()
-    assert not known[:, :, :4].any()
+    mosaic = update_mosaic(empty_mosaic(1, SIZE), after, still, none)
+    mosaic = update_mosaic(mosaic, last, -MOVES[1:2], none)
+    given = replace(shown(1, mosaic=mosaic), glimpse=glimpse_of_frames(last[:, None].repeat(1, SLOTS, 1, 1, 1)))
+    return replace(given, scroll=torch.tensor([1])), last, after
+
+
+def test_untrained_a_picture_goes_on_by_its_scroll_but_for_what_lies_over_it():
+    made, (given, last, after) = network(wild=False), scrolled()
+    made.over[:, :4] = True
+    drawn = pixels(made.draw(noise(1, 0), given))
+    assert torch.equal(drawn[..., 6:], after[..., 6:]) and torch.equal(drawn[..., :4], last[..., :4])
+
+
+def test_memory_shows_what_enters_and_not_what_lies_over_it(monkeypatch):
+    made, (given, _, after), seen = network(wild=False), scrolled(), []
+    made.over[:, :4] = True
+    monkeypatch.setattr(made, "_remembered", lambda memory, base: seen.append(memory) or base.new_zeros(1, 4, *SIZE))
+    made.draw(noise(1, 0), given)
+    assert len(seen) == made.config.steps
+    assert torch.equal(seen[0][:, :3, :, 4:], after[..., 4:]) and (seen[0][:, 3, :, 4:] > 0).all()
+    assert not seen[0][..., :4].any()
 
 
 def test_it_is_loaded_as_it_was_saved(tmp_path):

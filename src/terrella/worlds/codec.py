@@ -23,6 +23,7 @@ from ..space.matching import (
 )
 from ..space.mosaic import read_mosaic
 from .generator import Block, Conditioning, down_and_up, encode_depth, generate
+from .scroll import Scroll, frames_of, predicted_scroll
 
 COARSE = 4  # side in pixels of the squares that the trunk sees; choices are made for each pixel
 PIXEL = 16  # features of each pixel from its square, and as many from its neighbours
@@ -57,32 +58,6 @@ class CodecInputs(NamedTuple):
     over: torch.Tensor  # bool [B, H, W]: what lies over the picture and does not scroll with it
     went: torch.Tensor  # [B, moves + 1, H, W]: how well each move that leads to a pixel explained the last step there
     common: torch.Tensor  # [B, h, w, colours, 2]: share of each colour in all of `scrolled` and around each square
-
-
-class Scroll(nn.Module):
-    """Predicts by which of the moves most of the picture scrolls next."""
-
-    def __init__(self, config: CodecConfig):
-        super().__init__()
-        (height, width), moves = config.size, config.moves + 1
-        self.glance = nn.Sequential(
-            nn.AvgPool2d(2), nn.Conv2d(3, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 2, stride=2), nn.SiLU(), nn.Flatten(),
-            nn.Linear(48 * (height // 16) * (width // 16), 64), nn.SiLU(),
-        )  # fmt: skip
-        self.known = nn.Linear(64 + config.context + (config.slots - 1) * moves, 128)
-        self.votes = nn.Linear(128, moves)
-        nn.init.zeros_(self.votes.weight)
-        self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * config.moves))  # untrained, nothing scrolls
-
-    def frame_features(self, frame: torch.Tensor) -> torch.Tensor:
-        """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
-        return self.glance(frame.float() / 127.5 - 1)
-
-    def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
-        """Logits [B, moves + 1]. seen: of `frame_features`; went [B, slots - 1, moves + 1]: how well each move explained each
-        frame by the one before, 0..1."""
-        went = went / went.amax(2, keepdim=True).clamp_min(0.01)
-        return self.votes(F.silu(self.known(torch.cat([seen, context, went.pow(4).flatten(1)], 1))))
 
 
 @final
@@ -132,7 +107,7 @@ class Codec(nn.Module):
         """The next frame [B, 4, H, W] in the generator's code; `noisy` is its source of chance, the time is not used."""
         mosaic, over, scroll = conditioning.mosaic, conditioning.over, conditioning.scroll
         assert mosaic is not None and over is not None and scroll is not None
-        seen = self.seen(_frames(conditioning), mosaic, over, scroll)
+        seen = self.seen(frames_of(conditioning), mosaic, over, scroll)
         choices, features = self.choices(seen, conditioning.context)
         if conditioning.evidence:  # what scrolls into the picture is as it was seen
             comes = (self._beyond(seen.over) & seen.known).gather(1, seen.along[:, None])
@@ -154,10 +129,7 @@ class Codec(nn.Module):
         knows of the picture, if it holds evidence alone."""
         if conditioning.mosaic is None:
             return conditioning
-        frames, context = _frames(conditioning), conditioning.context
-        went = [edge_shares(one, other, self.moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
-        logits = self.scrolling(self.scrolling.frame_features(frames[:, 0]), context, torch.stack(went, 1))
-        scroll = least_off(logits, self.moves)
+        scroll = predicted_scroll(self.scrolling, conditioning, self.moves)
         if not conditioning.evidence or conditioning.over is None:
             return replace(conditioning, scroll=scroll)
         votes = read_mosaic(conditioning.mosaic, self.config.size, self.moves[scroll])[:, 3]
@@ -255,11 +227,6 @@ class Codec(nn.Module):
         return went.flatten(2).gather(2, place.expand(len(went), -1, -1)).unflatten(2, (height, width))
 
 
-def _frames(conditioning: Conditioning) -> torch.Tensor:
-    """The last frames, uint8 [B, slots, 3, H, W], the newest first."""
-    return (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
-
-
 def without_smears(drawn: torch.Tensor, seen: CodecInputs) -> torch.Tensor:
     """Frames uint8 [B, 3, H, W] as they were remembered where most of a square of THING pixels differs from that: things are
     smaller, so it is a smear."""
@@ -277,10 +244,3 @@ def shared_chance(noise: torch.Tensor, choices: torch.Tensor) -> torch.Tensor:
     they are uncertain they choose alike, and a thing stays whole (a maximal coupling)."""
     uniform = torch.special.ndtr(noise.flatten(1)[:, : choices.shape[1]]).clamp(1e-6, 1 - 1e-6)
     return -(-uniform.log()).log()[:, :, None, None]
-
-
-def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
-    """The move int64 [B], of `moves` [K, 2] with logits [B, K], with the least expected error in pixels: where several are likely
-    one in the middle, since a picture that is off stays off."""
-    off = (moves[:, None] - moves).abs().sum(2).float()
-    return (logits.softmax(1) @ off).argmin(1)

@@ -47,7 +47,10 @@ Make = Callable[[Any, Tensors, Tensors], Any]
 # What reading a damaged folder may raise.
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
-HALVED = ("uncertainty", "estimator")  # parts whose weights are stored in half precision, as those of a flow network are
+HALVED = (
+    "uncertainty",
+    "estimator",
+)  # parts whose weights are stored in half precision, as those of a flow network are
 
 
 def save_world(

@@ -12,9 +12,10 @@ import torch.nn.functional as F
 from ...core.errors import DatasetError
 from ...space.matching import CLEAR, prefer_scroll, scroll_index, source_shares
 from ...space.mosaic import update_mosaic
-from ...worlds.codec import Codec, CodecInputs, Scroll
+from ...worlds.codec import Codec, CodecInputs
 from ...worlds.controls import Controls
 from ...worlds.generator import channels_last, context_thumbnail
+from ...worlds.scroll import Scroll
 from ..moves import mosaics
 from ..muon import muon
 from ..trainer import Ema, Loss, TrainStep, warmup_cosine

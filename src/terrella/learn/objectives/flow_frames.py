@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ...space.matching import scroll_index
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowNetwork
 from ...worlds.frame_history import glimpse_of_frames
@@ -79,8 +80,8 @@ class FlowClipMaker:
 
 
 class FlowFrames:
-    """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise or memory, and later
-    also at a random t with memory. stress: the additional weight of pixels that change."""
+    """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise, and later also at a
+    random t. Pictures are carried along by the true scroll. stress: the additional weight of pixels that change otherwise."""
 
     def __init__(self, network: FlowNetwork, learning_rate: float, spans: Spans, stress: float):
         self.stress, self.spans, self.losses_per_batch = stress, spans, spans.rollout  # gradient steps per batch
@@ -99,23 +100,28 @@ class FlowFrames:
             truth, before = recorded[:, step], recorded[:, step - 1]
             context = torch.cat([context_thumbnail(shown[:, 0]), actions[:, step - slots : step].flip(1).flatten(1)], 1)
             memory = None if batch.memory is None else batch.memory[:, step - slots].to(now.device)
-            yield self._loss(shown, context, memory, truth, before, now)
+            scroll = None
+            if self.generator.scrolling is not None:
+                scroll = scroll_index(shown[:, 0], truth, self.generator.moves)
+            yield self._loss(shown, context, memory, scroll, truth, before, now)
             count = half if step + 1 < recorded.shape[1] else 0
-            drawn = self._drawn(shown[:count], context[:count], now) if count else truth[:0]
+            drawn = self._drawn(shown[:count], context[:count], scroll, now) if count else truth[:0]
             shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, context, memory, truth, before, now: TrainStep) -> Loss:
+    def _loss(self, shown, context, memory, scroll, truth, before, now: TrainStep) -> Loss:
         """The loss of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
         batch, network = len(truth), self.generator
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
-        last = frames[:, 0]
+        base, was = frames[:, 0], before.float() / 127.5 - 1
+        if scroll is not None:
+            base, was = network.carried(base, scroll), network.carried(was, scroll)
+        changes = (clean - was).abs().amax(1, keepdim=True) > CHANGED / 127.5
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
         frames = frames + level * now.randn(*frames.shape)
-        changes = (truth.int() - before.int()).abs().amax(1, keepdim=True) > CHANGED
         with now.half():
-            seen = network.encode(frames, context)
-            draft = network.clean(seen, seen.last, torch.zeros(batch, device=now.device), None)
-        parts = {"draft": self._error(draft, clean, last, changes)}
+            seen = network.encode(frames, context, scroll)
+            draft = network.clean(seen, seen.base, torch.zeros(batch, device=now.device), memory)
+        parts = {"draft": self._error(draft, clean, base, changes)}
         if now.share < DRAFTS:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
@@ -123,24 +129,31 @@ class FlowFrames:
         noisy = (1 - share) * now.randn(*clean.shape) + share * clean
         with now.half():
             drawn = network.clean(seen, noisy, t, memory)
-        parts["drawn"] = self._error(drawn, clean, last, changes)
+        parts["drawn"] = self._error(drawn, clean, base, changes)
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
 
-    def _error(self, drawn, clean, last, changes) -> torch.Tensor:
+    def _error(self, drawn, clean, base, changes) -> torch.Tensor:
         """The mean of absolute and squared errors [B, 3, H, W]. Pixels that change, in the recording (bool [B, 1, H, W]) or in what
         is drawn, weigh more: otherwise a ball of two pixels would be ignored."""
-        changed = changes | ((drawn.detach() - last).abs().amax(1, keepdim=True) > CHANGED / 127.5)
+        changed = changes | ((drawn.detach() - base).abs().amax(1, keepdim=True) > CHANGED / 127.5)
         weight = 1 + self.stress * changed.float()
         away = drawn - clean
         return (weight * (away.abs() + away.square())).mean() / (1 + self.stress * changes.float().mean())
 
+    def freeze_scroll(self) -> None:
+        """Stops training of the scroll predictor, here and in the average."""
+        if self.generator.scrolling is not None:
+            self.smooth.module.scrolling.load_state_dict(self.generator.scrolling.requires_grad_(False).state_dict())
+
     @torch.no_grad()
-    def _drawn(self, shown, context, now: TrainStep) -> torch.Tensor:
-        """Frames uint8 [B, 3, H, W] that follow those `shown`, by the averaged weights, without memory, in 1 step or more."""
+    def _drawn(self, shown, context, scroll, now: TrainStep) -> torch.Tensor:
+        """Frames uint8 [B, 3, H, W] that follow those `shown` by the true scroll, drawn by the averaged weights in 1 step or more,
+        without memory."""
         network = self.smooth.module
         steps = 1 + int(now.rng.integers(network.config.steps)) * (now.share > DRAFTS)
         noise = now.randn(len(shown), 4, *network.config.size)
-        glimpse = glimpse_of_frames(shown)
+        scroll = None if scroll is None else scroll[: len(shown)]
+        given = Conditioning(glimpse_of_frames(shown), noise, context, scroll=scroll)
         with now.half():
-            clean = network.draw(noise, Conditioning(glimpse, noise, context), steps)
+            clean = network.draw(noise, given, steps)
         return pixels(clean.float())

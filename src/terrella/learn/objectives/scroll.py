@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 
 from ...space.matching import clear_index, edge_shares
-from ...worlds.codec import Scroll, least_off
 from ...worlds.generator import context_thumbnail
+from ...worlds.scroll import Scroll, least_off
 from ..feeds import RandomBatches
 from ..recording import Recording
 from ..trainer import Loss, Run, Trainer, TrainStep, adamw, warmup_cosine

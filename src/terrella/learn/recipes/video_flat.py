@@ -129,9 +129,11 @@ class FlowRecipe:
         widths = config.channels or FlowConfig.channels
         settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths)
         network = FlowNetwork(settings)
-        network.moves[:] = moves
+        network.moves[:], network.over[:] = moves, self.over & (len(moves) > 1)
         spans = Spans.fitting(_lengths(recording), self.video.slots, 0, FLOW_ROLLOUT)
-        self.objective = FlowFrames(network, config.learning_rate or 1.2e-3, spans, statistics.stress)
+        self.objective = FlowFrames(
+            network, config.learning_rate or 1.2e-3, spans, stress_of(recording, network, config.seed)
+        )
         self.stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
         self.ground = None if self.stitched is None else joined(list(self.stitched.grounds.values()))
         self.starts: StartClips | None = None  # made once
@@ -143,7 +145,15 @@ class FlowRecipe:
         return flow_feed(recording, self.video, self.objective.spans, maker, self.parts.config.seed)
 
     def preparations(self) -> list[Stage]:
-        return self.parts.outcome_stages()
+        scrolls = [Stage("scroll", 0.1, self._learn_scroll)] if self.stitched is not None else []
+        return [*scrolls, *self.parts.outcome_stages()]
+
+    def _learn_scroll(self) -> None:
+        run, network = self.parts.run, self.objective.generator
+        assert network.scrolling is not None
+        if not resume_file(run.out, "flow").exists():
+            learn_scroll(run, network.scrolling, self.parts.recording, network.moves, self.video.slots)
+        self.objective.freeze_scroll()
 
     def world(self, trainer: Trainer) -> LearnedWorld:
         moves = self.objective.generator.moves.cpu()
@@ -234,6 +244,18 @@ def scrolls_of(recording: Recording, statistics: CodecStatistics, seed: int) -> 
     often = count >= SCROLLS * len(rows)
     often[0] = True
     return moves[often]
+
+
+def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
+    """The weight of pixels that change, apart from the scroll of the whole picture, in the loss of a flow network: such that they
+    are up to CHANGED_SHARE of it."""
+    rows = recording.rows_within(1, 0)
+    rows = np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False)
+    before, after = recording.rgb(rows - 1), recording.rgb(rows)
+    if network.scrolling is not None:
+        before = network.carried(before, scroll_index(before, after, network.moves))
+    change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean()
+    return float(np.clip(CHANGED_SHARE / max(float(change), 1e-4), 1, MAX_STRESS))
 
 
 def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS) -> CodecStatistics:
