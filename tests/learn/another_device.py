@@ -6,6 +6,8 @@ Run as a program, for the pretence changes torch for the whole process. `test_de
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -15,9 +17,11 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 from terrella.core import make_rng
 from terrella.learn.moves import mosaics
 from terrella.learn.objectives.codec import RECORDED, CodecClips, CodecObjective, Spans
+from terrella.learn.objectives.flow_frames import FlowClips, FlowFrames
 from terrella.learn.objectives.scroll import LENGTH, ScrollClips, ScrollObjective
 from terrella.learn.trainer import TrainStep
 from terrella.worlds.codec import Codec, CodecConfig
+from terrella.worlds.flow import FlowConfig, FlowNetwork
 
 _setup_privateuseone_for_python_backend("other")
 OTHER, CPU = torch.device("other:0"), torch.device("cpu")
@@ -81,16 +85,21 @@ def main() -> None:
         torch.cat([truth, truth[:, :1]], 1), torch.zeros(4, LENGTH, 36 + 4 * 2), torch.rand(4, 3 + LENGTH, 3)
     )
     objective = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, over)
+    network = FlowNetwork(FlowConfig(size, 4, 36 + 4 * 2, 2, (8, 8, 8)))
+    network.moves[:], network.over[:] = moves, over
+    flow = FlowFrames(network, 1e-3, Spans(0, 4, 3), 2.0)
+    seen = FlowClips(truth, torch.zeros(4, 7, 2), torch.randint(0, 256, (4, 3, 4, *size), dtype=torch.uint8))
     scrolling = object.__new__(ScrollObjective)  # without a recording
     scrolling.scroll, scrolling.moves, scrolling.slots = objective.scroll, moves, 4
     with Pretended():
-        for module in objective.modules.values():
+        for module in (*objective.modules.values(), *flow.modules.values()):
             module.to(OTHER)
         try:
             codec.moves + moves
         except RuntimeError:
             print("mixing is refused")
-        for losses in (objective.losses(clip, now), scrolling.losses(piece, now)):
+        late = replace(now, share=0.9)
+        for losses in (objective.losses(clip, now), flow.losses(seen, late), scrolling.losses(piece, now)):
             for loss in losses:
                 assert loss.value.device == OTHER
                 print(f"{loss.learner} has a loss")

@@ -13,7 +13,8 @@ from terrella.learn.objectives import scroll as stage
 from terrella.learn.objectives.scroll import ScrollObjective, learn_scroll
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run
-from terrella.worlds.codec import CodecConfig, Scroll, least_off
+from terrella.worlds.codec import CodecConfig
+from terrella.worlds.scroll import Scroll, least_off
 
 SIZE, SLOTS = (32, 40), 3
 MOVES = torch.tensor([[0, 0], [2, 0], [-2, 0]])

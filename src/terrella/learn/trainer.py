@@ -392,8 +392,9 @@ def cosine_decay(share: float, low: float = 0.0) -> float:
 
 def half_precision(device: torch.device) -> torch.autocast:
     """bfloat16 where the device computes it natively."""
-    native = device.type == "cuda" or torch.backends.cpu.get_cpu_capability() == "AVX512" and _cpu_has_bf16()
-    return torch.autocast(device.type, torch.bfloat16, enabled=native)
+    avx512 = device.type == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX512"
+    native = device.type == "cuda" or avx512 and _cpu_has_bf16()
+    return torch.autocast(device.type if native else "cpu", torch.bfloat16, enabled=native)
 
 
 def _cpu_has_bf16() -> bool:
