@@ -104,7 +104,13 @@ def test_untrained_a_picture_goes_on_by_its_scroll_but_for_what_lies_over_it():
     made, (given, last, after) = network(wild=False), scrolled()
     made.over[:, :4] = True
     drawn = pixels(made.draw(noise(1, 0), given))
-    assert torch.equal(drawn[..., 6:], after[..., 6:]) and torch.equal(drawn[..., :4], last[..., :4])
+    assert torch.equal(drawn[..., :4], last[..., :4]), "it lies over the picture"
+    assert torch.equal(drawn[..., 4:], after[..., 4:]), "what was under it is remembered"
+    made.over[:] = False
+    drawn = pixels(made.draw(noise(1, 0), given))
+    assert torch.equal(drawn, after), "what enters is remembered"
+    drawn = pixels(made.draw(noise(1, 0), replace(given, mosaic=empty_mosaic(1, SIZE))))
+    assert torch.equal(drawn[..., 2:], after[..., 2:]) and torch.equal(drawn[..., 0], last[..., 0])
 
 
 def test_memory_shows_what_enters_and_not_what_lies_over_it(monkeypatch):

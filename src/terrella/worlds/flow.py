@@ -46,7 +46,7 @@ class FlowFeatures(NamedTuple):
 
     maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # at 1/4, 1/8 and 1/16 of the size
     embedding: torch.Tensor  # [B, WIDE] of the actions
-    base: torch.Tensor  # [B, 3, H, W] in -1..1: the last frame, carried along where the picture scrolls
+    base: torch.Tensor  # [B, 3, H, W] in -1..1: the last frame, or `carried` where pictures scroll
     older: torch.Tensor  # [B, 3, H, W]: the frame before
 
 
@@ -97,9 +97,15 @@ class FlowNetwork(nn.Module):
         nn.init.zeros_(self.output.weight)  # untrained, the last frame stays
         self.output.bias = nn.Parameter(torch.zeros(3))
 
-    def encode(self, frames: torch.Tensor, context: torch.Tensor, scroll: torch.Tensor | None = None) -> FlowFeatures:
-        """Of frames [B, slots, 3, H, W] in -1..1, the newest first, the context [B, n], and by which move int64 [B] most of the
-        picture goes on."""
+    def encode(
+        self,
+        frames: torch.Tensor,
+        context: torch.Tensor,
+        scroll: torch.Tensor | None = None,
+        memory: torch.Tensor | None = None,
+    ) -> FlowFeatures:
+        """Of frames [B, slots, 3, H, W] in -1..1, the newest first, the context [B, n], by which move int64 [B] most of the picture
+        goes on, and memory uint8 [B, 4, H, W]: colours of the next frame and whether (over 0) they are known."""
         embedding = self.actions(context)
         fine = self.before[0](self.enter(self._squares(frames.flatten(1, 2))), embedding)
         middle = self.before[1](self.down[0](fine), embedding)
@@ -107,14 +113,13 @@ class FlowNetwork(nn.Module):
         tokens = coarse.flatten(2).transpose(1, 2)
         attended = self.attention(tokens, tokens, tokens, need_weights=False)[0]
         coarse = coarse + attended.transpose(1, 2).unflatten(2, coarse.shape[-2:])
-        base = frames[:, 0] if scroll is None else self.carried(frames[:, 0], scroll)
+        base = frames[:, 0] if scroll is None else self.carried(frames[:, 0], scroll, memory)
         return FlowFeatures((fine, middle, coarse), embedding, base, frames[:, min(1, frames.shape[1] - 1)])
 
     def clean(
         self, seen: FlowFeatures, noisy: torch.Tensor, time: torch.Tensor, memory: torch.Tensor | None
     ) -> torch.Tensor:
-        """The clean frame [B, 3, H, W] in -1..1 by `noisy` of the same shape at flow time [B]. memory uint8 [B, 4, H, W]: colours
-        of the next frame and whether (over 0) they are known; None: nothing is."""
+        """The clean frame [B, 3, H, W] in -1..1 by `noisy` of the same shape at flow time [B]. memory: as in `encode`."""
         (fine, middle, coarse), embedding, base, older = seen
         angle = time[:, None] * (2.0 ** torch.arange(FREQUENCIES, device=time.device)) * (math.pi / 2)
         embedding = embedding + self.time(torch.cat([angle.sin(), angle.cos()], 1))
@@ -137,9 +142,9 @@ class FlowNetwork(nn.Module):
             parts = [slice(first, first + AT_ONCE) for first in range(0, len(noise), AT_ONCE)]
             return torch.cat([self.draw(noise[part], conditioning.at(part), steps) for part in parts])
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
-        seen = self.encode(conditioning.glimpse.rgb * 2 - 1, conditioning.context, scroll)
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]) * ~self.over
+        seen = self.encode(conditioning.glimpse.rgb * 2 - 1, conditioning.context, scroll, memory)
         time = torch.zeros(len(noise), device=noise.device)
         x = self.clean(seen, seen.base, time, memory)
         for step in range(1, steps):
@@ -155,13 +160,19 @@ class FlowNetwork(nn.Module):
             return conditioning
         return replace(conditioning, scroll=predicted_scroll(self.scrolling, conditioning, self.moves))
 
-    def carried(self, last: torch.Tensor, scroll: torch.Tensor) -> torch.Tensor:
-        """Frames [B, 3, H, W] that went on by the moves `scroll` int64 [B], with replicated edges; what lies over them stays."""
+    def carried(self, last: torch.Tensor, scroll: torch.Tensor, memory: torch.Tensor | None) -> torch.Tensor:
+        """Frames [B, 3, H, W] in -1..1 that went on by the moves `scroll` int64 [B]; what lies over them stays. What was outside of
+        them, or under what lies over them, is as it is remembered, else as at the nearest edge."""
         height, width = self.config.size
         along = self.moves[torch.where(self.over, 0, scroll[:, None, None])]  # [B, H, W, 2]
-        x = (torch.arange(width, device=last.device) - along[..., 0]).clamp(0, width - 1)
-        y = (torch.arange(height, device=last.device)[:, None] - along[..., 1]).clamp(0, height - 1)
-        return last.flatten(2).gather(2, (y * width + x).flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
+        x = torch.arange(width, device=last.device) - along[..., 0]
+        y = torch.arange(height, device=last.device)[:, None] - along[..., 1]
+        place = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+        carried = last.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
+        if memory is None:
+            return carried
+        new = (x < 0) | (x >= width) | (y < 0) | (y >= height) | self.over.flatten()[place] & ~self.over
+        return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3].float() / 127.5 - 1, carried)
 
     def _remembered(self, memory: torch.Tensor | None, base: torch.Tensor) -> torch.Tensor:
         """Memory as maps [B, 4, H, W]: colours relative to the base, 0 where unknown, and whether known."""

@@ -114,12 +114,12 @@ class FlowFrames:
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
         base, was = frames[:, 0], before.float() / 127.5 - 1
         if scroll is not None:
-            base, was = network.carried(base, scroll), network.carried(was, scroll)
+            base, was = network.carried(base, scroll, memory), network.carried(was, scroll, memory)
         changes = (clean - was).abs().amax(1, keepdim=True) > CHANGED / 127.5
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
         frames = frames + level * now.randn(*frames.shape)
         with now.half():
-            seen = network.encode(frames, context, scroll)
+            seen = network.encode(frames, context, scroll, memory)
             draft = network.clean(seen, seen.base, torch.zeros(batch, device=now.device), memory)
         parts = {"draft": self._error(draft, clean, base, changes)}
         if now.share < DRAFTS:

@@ -17,6 +17,7 @@ from ...worlds.config import VideoConfig
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowConfig, FlowNetwork
 from ...worlds.frame_history import FrameHistory, StartClips
+from ...worlds.generator import pixels
 from ...worlds.learned import LearnedWorld
 from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
@@ -253,7 +254,8 @@ def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
     rows = np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False)
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
     if network.scrolling is not None:
-        before = network.carried(before, scroll_index(before, after, network.moves))
+        carried = network.carried(before.float() / 127.5 - 1, scroll_index(before, after, network.moves), None)
+        before = pixels(carried)
     change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean()
     return float(np.clip(CHANGED_SHARE / max(float(change), 1e-4), 1, MAX_STRESS))
 
