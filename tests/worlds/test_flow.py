@@ -12,7 +12,7 @@ from terrella.space.ground import window
 from terrella.space.mosaic import empty_mosaic, update_mosaic
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
-from terrella.worlds.flow import STAYS, FlowConfig, FlowNetwork
+from terrella.worlds.flow import RECALLED, STAYS, FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.frame_history import FrameHistory, StartClips, glimpse_of_frames
 from terrella.worlds.generator import Conditioning, pixels
@@ -111,6 +111,14 @@ def test_untrained_a_picture_goes_on_by_its_scroll_but_for_what_lies_over_it():
     assert torch.equal(drawn, after), "what enters is remembered"
     drawn = pixels(made.draw(noise(1, 0), replace(given, mosaic=empty_mosaic(1, SIZE))))
     assert torch.equal(drawn[..., 2:], after[..., 2:]) and torch.equal(drawn[..., 0], last[..., 0])
+
+
+@pytest.mark.parametrize(("by", "recalled"), [(0.9 * RECALLED, True), (1.2 * RECALLED, False)])
+def test_a_colour_near_the_remembered_one_is_as_remembered(by, recalled):
+    made, (given, _, after) = network(wild=False), scrolled()
+    made.output.bias += by
+    drawn = pixels(made.draw(noise(1, 0), given))
+    assert torch.equal(drawn, after) if recalled else (drawn > after).float().mean() > 0.9
 
 
 def test_memory_shows_what_enters_and_not_what_lies_over_it(monkeypatch):

@@ -26,6 +26,7 @@ WIDE = 128  # numbers of the embedding of actions and flow time
 DETAIL = 16  # features of each pixel from its square
 HEADS = 4  # of the attention over the coarsest map
 STAYS = 0.04  # a colour that would change by less, of -1 to 1, stays as it is
+RECALLED = 0.15  # a colour that differs by less from the remembered one is as remembered
 FREQUENCIES = 8  # of the sines and cosines of the flow time
 
 
@@ -150,8 +151,10 @@ class FlowNetwork(nn.Module):
         for step in range(1, steps):
             t = step / steps
             x = self.clean(seen, (1 - t) * noise[:, :3] + t * x.clamp(-1, 1), time + t, memory)
-        still = (x - seen.base).abs().amax(1, keepdim=True) < STAYS
-        x = torch.where(still, seen.base, x)
+        x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
+        if memory is not None:
+            known = memory[:, :3].float() / 127.5 - 1
+            x = torch.where(_alike(x, known, RECALLED) & (memory[:, 3:] > 0), known, x)
         return torch.cat([x, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
@@ -188,3 +191,8 @@ class FlowNetwork(nn.Module):
         if below or right:
             maps = F.pad(maps, (0, right, 0, below), mode="replicate")
         return F.pixel_unshuffle(maps, SQUARE).contiguous(memory_format=torch.channels_last)
+
+
+def _alike(one: torch.Tensor, other: torch.Tensor, most: float) -> torch.Tensor:
+    """bool [B, 1, H, W]: where colours [B, 3, H, W] differ by less than `most`."""
+    return (one - other).abs().amax(1, keepdim=True) < most
