@@ -19,7 +19,7 @@ from terrella import library
 from terrella.cli import main
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
-from terrella.learn.recipes.video import TrainingPace
+from terrella.learn.recipes.video import TrainConfig, TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
 from terrella.workflows.learn import LearnConfig, held_to_real_time
@@ -228,7 +228,7 @@ def test_what_the_minutes_give_is_said_before_they_are_spent(tmp_path, capsys, m
 
 
 def test_the_trial_times_a_recording_and_training_steps():
-    pace = time_environment(EnvironmentConfig().open(NAME), 0)
+    pace = time_environment(EnvironmentConfig().open(NAME), 0, TrainConfig())
     assert pace.frames_per_s > 1 and 0 < pace.training.step_s < 60 and 0.3 < pace.training.share < 0.9
 
 

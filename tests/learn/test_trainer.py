@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -168,6 +169,18 @@ def test_other_settings_and_foreign_files_are_refused(whole, tmp_path):
     (tmp_path / "resume-toy.safetensors").write_bytes(b"not a run at all")
     with pytest.raises(TrainingError, match="resume-toy.safetensors is not a run of this recipe"):
         trainer_in(tmp_path)
+
+
+def test_a_run_goes_on_with_a_setting_that_is_newer_than_it_at_its_default_alone(whole, tmp_path):
+    @dataclass(frozen=True)
+    class Newer(Settings):
+        way: str = "old"
+
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    assert Trainer(Run.of(out, Newer(), quiet, free=("hours",)), "toy", Walk(), Toy(), STEPS).finished
+    with pytest.raises(TrainingError, match="other settings .way None, not new"):
+        Trainer(Run.of(out, Newer(way="new"), quiet, free=("hours",)), "toy", Walk(), Toy(), STEPS)
 
 
 def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path):

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -154,6 +154,7 @@ class Run:
 
     recipe: JSON values that must stay the same for the run to be resumed.
     budget: the time that all stages share.
+    usual:  settings at their defaults: a run that was saved before there was such a setting had that default.
     """
 
     out: Path
@@ -164,6 +165,7 @@ class Run:
     save_every_s: float = 60.0
     strip_every_s: float = 300.0
     budget: Budget = field(default_factory=Budget, compare=False)
+    usual: frozenset[str] = frozenset()
 
     @staticmethod
     def of(
@@ -175,13 +177,14 @@ class Run:
         times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
         budget = Budget(Path(out), settings.get("hours", math.inf))
-        return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times, budget=budget)
+        usual = frozenset(one.name for one in fields(config) if settings[one.name] == one.default)
+        return Run(Path(out), {**fixed, **facts}, report, config.seed, device, **times, budget=budget, usual=usual)
 
     def saved_facts(self, stage: str) -> dict | None:
         """The facts of a stage that was begun; TrainingError if it had other settings, or another recording."""
         saved, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
         old = recipe if saved is None else saved.get("recipe", {})
-        both = {**old, **recipe}
+        both = {name: value for name, value in recipe.items() if name in old or name not in self.usual} | old
         other = [
             f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)
         ]

@@ -34,7 +34,7 @@ class Pace:
         return math.ceil(max(training_s / 0.7, training_s + 60) / 60)
 
 
-def time_environment(world: World, seed: int) -> Pace | None:
+def time_environment(world: World, seed: int, config: TrainConfig) -> Pace | None:
     """Records a few frames in a temporary folder and takes a few training steps on them; None where so few cannot be trained
     on, as of a very slow game."""
     with TemporaryDirectory() as folder:
@@ -51,7 +51,7 @@ def time_environment(world: World, seed: int) -> Pace | None:
         try:
             explore(world, Path(folder), TRIAL_FRAMES, seed, counted, options, enough=enough)
             frames_per_s = rows / (time.monotonic() - began)
-            return Pace(frames_per_s, time_training(folder, TrainConfig(), TRIAL_S))
+            return Pace(frames_per_s, time_training(folder, config, TRIAL_S))
         except (DatasetError, TrainingError):
             return None
 
