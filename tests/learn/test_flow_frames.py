@@ -12,6 +12,7 @@ from tests.learn.small import BARE
 from tests.learn.stopping import quiet, resumes_exactly
 
 from terrella.core import check_world, make_rng
+from terrella.core.errors import TrainingError
 from terrella.data import Recorder
 from terrella.learn.moves import stitch_episodes
 from terrella.learn.objectives.codec import Spans
@@ -120,3 +121,17 @@ def test_a_world_of_a_scrolling_recording_knows_its_ground(flow_run):
 
 def test_a_stopped_run_goes_on_exactly(flow_run, scrolling, tmp_path):
     resumes_exactly(lambda out: train_video(scrolling, out, FLAT, quiet), flow_run[0], tmp_path, {"flow": 1})
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [({"frames": 1}, "--frames 1"), ({"channels": (8, 8)}, "three, each"), ({"channels": (8, 8, 12)}, "of 8")],
+)
+def test_what_no_flow_network_can_be_made_of_is_refused(scrolling, tmp_path, given, why):
+    with pytest.raises(TrainingError, match=why):
+        train_video(scrolling, tmp_path, replace(FLAT, **given), quiet)
+
+
+def test_its_drawing_steps_can_be_chosen(scrolling, tmp_path):
+    train_video(scrolling, tmp_path, replace(FLAT, flow_steps=2, steps=3), quiet)
+    assert load_world(tmp_path / "world").generator.config.steps == 2

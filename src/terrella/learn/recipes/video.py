@@ -83,7 +83,8 @@ def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Repo
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
-    make = PosedRecipe if video.geometry else FLAT[config.generator] if config.flow_steps == 1 else FlatFlowRecipe
+    flat = FlatFlowRecipe if config.generator == "codec" and config.flow_steps > 1 else FLAT[config.generator]
+    make = PosedRecipe if video.geometry else flat
     return make(run, recording, config, video)
 
 

@@ -33,8 +33,9 @@ class TrainConfig:
     objects_steps: int = 2500
     # --no-moving: treat everything as static, although the recording marks what moves (monsters, doors, pick-ups).
     moving: bool = True
-    # Flow steps a frame. With more than one the whole flow from noise to frame is learned, so that a frame is a sample, not a
-    # mean. Such a world can be the teacher of `train distil`.
+    # Flow steps a frame (of `--generator flow` 3, unless more than 1 are given). With more than one the whole flow from noise to
+    # frame is learned, so that a frame is a sample, not a mean. A world of the default generator can then be the teacher of
+    # `train distil`.
     flow_steps: int = 1
     # Training steps of the generator. Training ends after these or after --hours, whichever comes first.
     steps: int = 8000

@@ -40,6 +40,7 @@ from .video_parts import VideoParts, flow_objective
 MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
 QUARTER = 0.25
+ONE_FRAME = "--frames 1: how things move is seen in two frames; give 2 or more."
 SCROLLS = 0.01  # see `scrolls_of`
 FLOW_ROLLOUT = 3  # steps of a clip that a flow network predicts
 REMEMBERED = 64  # steps before a start from which its mosaic is made
@@ -56,7 +57,7 @@ class CodecRecipe:
         self.parts = _flat_parts(run, recording, config, video)
         self.video = self.parts.video
         if self.video.slots < 2:
-            raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
+            raise TrainingError(ONE_FRAME)
         self.objective = self._objective()
         self.starts: StartClips | None = None  # made once
         self.ground: torch.Tensor | None = None  # chosen when the world is tuned
@@ -124,11 +125,16 @@ class FlowRecipe:
     def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
         self.parts = _flat_parts(run, recording, config, video)
         self.video = self.parts.video
+        widths = config.channels or FlowConfig.channels
+        if len(widths) != 3 or any(width % 8 for width in widths):
+            raise TrainingError("--channels: a flow network has three, each a multiple of 8, as 64 112 160.")
+        if self.video.slots < 2:
+            raise TrainingError(ONE_FRAME)
         statistics = _statistics_of(self.parts)
         moves, self.over = scrolls_of(recording, statistics, config.seed), statistics.over
         plain = self.video.generator
-        widths = config.channels or FlowConfig.channels
-        settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths)
+        steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
+        settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths, steps)
         network = FlowNetwork(settings)
         network.moves[:], network.over[:] = moves, self.over & (len(moves) > 1)
         spans = Spans.fitting(_lengths(recording), self.video.slots, 0, FLOW_ROLLOUT)
