@@ -28,7 +28,8 @@ from terrella.worlds.folder import load_world, save_world
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "learn": "--action-names --adapter --fps --frames --idle --json --keys --minutes --out --practise --randomise --seed --size",
+    "learn": "--action-names --adapter --fps --frames --generator --idle --json --keys --minutes --out --practise "
+    "--randomise --seed --size",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
     "--pictures --policy --port --randomise --seed --size --workers",

@@ -317,7 +317,10 @@ def test_every_kind_of_action_arrives_as_its_space_says(action):
 def test_what_it_says_of_itself():
     spec = GymnasiumWorld("CartPole-v1", GymnasiumConfig(rgb=False)).spec
     assert (spec.dt_s, spec.name, spec.forkable, spec.max_batch) == (0.02, "gym:CartPole-v1", True, None)
-    assert spec.keys == {"ArrowLeft": [0.0], "ArrowRight": [1.0]} and "rgb" not in spec.channels
+    assert spec.keys["ArrowLeft"] == spec.keys["KeyA"] == [0.0] and spec.keys["ArrowRight"] == spec.keys["KeyD"] == [
+        1.0
+    ]
+    assert spec.action_names == ("push left", "push right") and "rgb" not in spec.channels
     assert GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False)).spec.dt_s == 0.05
     assert GymnasiumWorld("Pendulum-v1", GymnasiumConfig(rgb=False, dt_s=0.1)).spec.dt_s == 0.1
 

@@ -62,8 +62,8 @@ def walk(world: LearnedWorld, look: bool, steps: int = 6, batch: int = 2):
 
 def test_a_frame_is_drawn_when_somebody_looks_and_looking_changes_nothing(monkeypatch):
     world, drawn = place(KINDS["buttons"]), []
-    real = learned.generate
-    monkeypatch.setattr(learned, "generate", lambda *given: (drawn.append(len(given[1])), real(*given))[1])
+    real = world.generator.draw
+    monkeypatch.setattr(world.generator, "draw", lambda *given: (drawn.append(len(given[0])), real(*given))[1])
     state = walk(world, look=False)
     world.render(state, ("pose", "reward", "done"))
     assert not drawn, "pose, reward and done cost no pixels"
@@ -89,8 +89,8 @@ def test_of_a_batch_those_off_known_ground_alone_are_drawn(monkeypatch):
     state = world.start(3, rng)
     far = state["pose"] + torch.tensor([[0.0], [50.0], [0.0]]) * torch.eye(7)[0]
     state = world.observe({"pose": far}, state, rng)
-    real = learned.generate
-    monkeypatch.setattr(learned, "generate", lambda *given: (drawn.append(len(given[1])), real(*given))[1])
+    real = world.generator.draw
+    monkeypatch.setattr(world.generator, "draw", lambda *given: (drawn.append(len(given[0])), real(*given))[1])
     after, chance_then = [state], rng.get_state()
     for _ in range(4):
         after.append(world.imagine(after[-1], action, rng))
