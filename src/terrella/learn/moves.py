@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core.files import write_json
-from ..space.ground import joined, window
+from ..space.ground import cropped, joined, window
 from ..space.matching import gather_sources, half_pixel_bounds, scroll_index
 from ..space.mosaic import empty_mosaic, middle, update_mosaic
 from .recording import Recording
@@ -188,8 +188,9 @@ def stitch_episodes(recording: Recording, moves: torch.Tensor, over: torch.Tenso
             before = frame
         if whole is not None:  # the last picture lies in the middle
             centre = torch.tensor(middle(whole, before.shape[-2:])[::-1])
-            place[first:last] += centre - place[last - 1]
-            grounds[episode] = whole[0]
+            y, x = (torch.nonzero((whole[0, 3] > 0).any(dim))[:1].sum() for dim in (1, 0))  # of the upper left corner
+            place[first:last] += centre - place[last - 1] - torch.stack([x, y])
+            grounds[episode] = cropped(whole[0])
     return StitchedEpisodes(grounds, place, number)
 
 

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..space.mosaic import read_mosaic
-from .generator import AT_ONCE, Conditioning, encode_depth
+from .generator import Conditioning, encode_depth, parts_of
 from .scroll import Scroll, predicted_scroll
 
 SQUARE = 4  # side in pixels of the squares that the U-Net sees
@@ -139,8 +139,7 @@ class FlowNetwork(nn.Module):
         """The next frame in the generator's code [B, 4, H, W], drawn from `noise` [B, 4, H, W] in `steps` steps, by default
         config.steps."""
         steps = steps or self.config.steps
-        if noise.device.type == "cpu" and len(noise) > AT_ONCE:
-            parts = [slice(first, first + AT_ONCE) for first in range(0, len(noise), AT_ONCE)]
+        if parts := parts_of(noise):
             return torch.cat([self.draw(noise[part], conditioning.at(part), steps) for part in parts])
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:

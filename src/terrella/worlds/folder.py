@@ -47,10 +47,7 @@ Make = Callable[[Any, Tensors, Tensors], Any]
 # What reading a damaged folder may raise.
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
-HALVED = (
-    "uncertainty",
-    "estimator",
-)  # parts whose weights are stored in half precision, as those of a flow network are
+HALVED = ("uncertainty", "estimator")  # parts stored in half precision; so are the weights of a flow network
 
 
 def save_world(

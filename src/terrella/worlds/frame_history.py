@@ -169,8 +169,6 @@ class FrameHistory:
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
-        if mosaic is not None and scroll is None:
-            scroll = scroll_index(newest_frame(state), frame.rgb, self.moves)
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
         if self.grounded and scroll is not None:
             flat["place"] = state["place"] - self.moves[scroll]

@@ -205,10 +205,16 @@ def decode(clean: torch.Tensor, posed: bool) -> DrawnFrame:
     return DrawnFrame(pixels(clean), depth, clean[:, 4].sigmoid() if clean.shape[1] > 4 else None)
 
 
+def parts_of(noise: torch.Tensor) -> list[slice]:
+    """The parts of a batch that are drawn one after another, where it is too large for one pass; else none."""
+    if noise.device.type != "cpu" or len(noise) <= AT_ONCE:
+        return []
+    return [slice(first, first + AT_ONCE) for first in range(0, len(noise), AT_ONCE)]
+
+
 def generate(generator: nn.Module, noise: torch.Tensor, conditioning: Conditioning, steps: int) -> torch.Tensor:
     """Noise to frame in `steps` Euler steps of the straight flow."""
-    if noise.device.type == "cpu" and len(noise) > AT_ONCE:
-        parts = [slice(first, first + AT_ONCE) for first in range(0, len(noise), AT_ONCE)]
+    if parts := parts_of(noise):
         return torch.cat([generate(generator, noise[part], conditioning.at(part), steps) for part in parts])
     x = noise
     for step in range(steps):

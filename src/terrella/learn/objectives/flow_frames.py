@@ -52,7 +52,7 @@ class FlowClipMaker:
         """From clips (rgb uint8 [N, T, H, W, 3], action [N, T, ...], row [N, T])."""
         rgb, action = np.asarray(clips["rgb"]), np.asarray(clips["action"], np.float32)
         one, other = rgb[:, self.slots - 1 : -1], rgb[:, self.slots :]
-        differs = ((np.maximum(one, other) - np.minimum(one, other)).max(-1) > 8).mean((2, 3)).max(1)
+        differs = ((np.maximum(one, other) - np.minimum(one, other)).max(-1) > CHANGED).mean((2, 3)).max(1)
         weight = 0.2 + 1.0 * (differs > 0.005) + 2.0 * (differs > 0.2)
         picks = now.rng.choice(len(rgb), self.batch, replace=len(rgb) < self.batch, p=weight / weight.sum())
         picks = now.rng.permutation(picks)
