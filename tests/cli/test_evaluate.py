@@ -42,7 +42,8 @@ def test_a_dream_that_is_reality_agrees_and_what_was_stopped_goes_on(capsys, tmp
 
     monkeypatch.setattr(PairedEvaluation, "play", stopped)
     assert main(["evaluate", *FIVE, "--out", str(tmp_path / "part")]) == 130
-    assert "the same command continues" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "the same command continues. So far: " in said and "constant:2 return 14.3 of 6" in said
     part = evaluated(capsys, *FIVE, "--out", str(tmp_path / "part"))
     assert len(played) == 1 + 7 and part["rows"] == whole["rows"] and part["dream"] == whole["dream"]
     assert main(["evaluate", *FIVE, "--out", str(tmp_path / "part"), "--seed", "1"]) == 2

@@ -10,12 +10,13 @@ import pytest
 from tests.cli.tiny import NAME
 
 import terrella
-from terrella.act.planning import Planner
+from terrella.act.planning import Planner, episodes
 from terrella.cli import main
 from terrella.core.errors import TerrellaError
 from terrella.sim.randomised import Randomised
 from terrella.workflows.opening import EnvironmentConfig
-from terrella.workflows.plan_study import open_study
+from terrella.workflows.plan_study import PlanConfig, open_study
+from terrella.workflows.progress import silent
 from terrella.workflows.real_environment import open_copied, open_real, refuse_randomised
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
@@ -156,29 +157,42 @@ def test_the_real_environment_is_never_randomised(tmp_path):
         refuse_randomised("doom-maze", environment)
 
 
-def test_a_plan_that_is_stopped_keeps_the_episodes_that_are_done(capsys, tmp_path, monkeypatch):
+def test_a_plan_that_is_stopped_shows_how_far_it_came_beside_as_many_random_steps(capsys, tmp_path, monkeypatch):
     act, calls = Planner.act, []
 
     def stopped(planner, *given):
         calls.append(1)
-        if len(calls) > 10:
+        if len(calls) > 3:
             raise KeyboardInterrupt
         return act(planner, *given)
 
     monkeypatch.setattr(Planner, "act", stopped)
     words = [BLIND, "--goal", "observation=20", "--within", "0.001", "--search", "tree", *QUICK]
     assert main(["plan", *words, "--out", str(tmp_path)]) == 130
-    result = json.loads(capsys.readouterr().out)
-    whole = json.loads((tmp_path / "plan.json").read_text())
-    assert (
-        result["stopped"]
-        and result["random"] == {}
-        and "of 4 episodes are done" in (tmp_path / "plan.html").read_text()
-    )
-    assert 0 < len(whole["played"]) < 4 and all(one["success"] for one in whole["played"])
+    result, whole = json.loads(capsys.readouterr().out), json.loads((tmp_path / "plan.json").read_text())
+    assert result["stopped"] and [one["steps"] for one in whole["played"]].count(3) == 2 and len(whole["played"]) == 4
+    assert result["planner"]["success"]["count"] == result["random"]["success"]["count"] == 4
+    assert "the first 3 of at most 24 steps" in (tmp_path / "plan.html").read_text()
     calls[:] = [1] * 10
     assert main(["plan", *words, "--out", str(tmp_path / "none")]) == 130
-    assert "before the first episode" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "before the first decision" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
+def test_a_plan_that_plays_one_episode_after_the_other_keeps_those_that_are_done(monkeypatch):
+    study = open_study(BLIND, PlanConfig("observation=20", within=0.001, episodes=4, steps=24), silent)
+    study = replace(study, real=copy(study.real))
+    study.real.spec = replace(study.real.spec, forkable=False)
+    played, play_from = [], episodes.play_from
+
+    def stopped(*given):
+        played.append(1)
+        if len(played) > 2:
+            raise KeyboardInterrupt
+        return play_from(*given)
+
+    monkeypatch.setattr(episodes, "play_from", stopped)
+    done = study.run()
+    assert done.stopped and not done.cut and len(done.planner.episodes) == 2 and done.random is None
 
 
 def test_planning_from_python(tmp_path):

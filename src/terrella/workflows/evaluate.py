@@ -15,7 +15,18 @@ from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, observed_channels
 from ..core.spec import Spec
 from ..core.world import World
-from ..measure.policy_evaluation import RANDOM, PolicyEvaluation, as_dict, evaluate_policies, table, verdict
+from ..measure.policy_evaluation import (
+    DREAM,
+    RANDOM,
+    REAL,
+    RETURN,
+    SUCCESS,
+    PolicyEvaluation,
+    as_dict,
+    evaluate_policies,
+    table,
+    verdict,
+)
 from ..measure.policy_evaluation_page import policy_evaluation_page
 from .evaluation_log import EvaluationLog, crc_of, fingerprint
 from .goals import REWARD, read_goal
@@ -121,12 +132,21 @@ def _play(study: _Study, log: EvaluationLog, names: tuple[str, ...], episodes: i
                         log.add(name, number * CHUNK, _played(study, name, number, count))
             report(1, 1)
     except KeyboardInterrupt:
-        safe = min(log.count(name) for name in names)
-        raise KeyboardInterrupt(
-            f"stopped: {safe} of {episodes} episodes of each policy are safe in {log.file}; the same command continues."
-        ) from None
+        raise KeyboardInterrupt(_stopped(log, names, episodes)) from None
     finally:
         log.save()
+
+
+def _stopped(log: EvaluationLog, names: tuple[str, ...], episodes: int) -> str:
+    """What is safe, and the mean of each policy so far."""
+    safe, means = min(log.count(name) for name in names), []
+    for name in filter(log.count, names):
+        arms = log.scores(name, episodes)
+        measures = arms.get(REAL) or arms[DREAM]
+        what = SUCCESS if SUCCESS in measures else RETURN
+        means.append(f"{name} {what} {float(measures[what].mean()):.3g} of {log.count(name)}")
+    far = f" So far: {', '.join(means)}." if means else ""
+    return f"stopped: {safe} of {episodes} episodes of each policy are safe in {log.file}; the same command continues.{far}"
 
 
 def _played(study: _Study, name: str, number: int, count: int) -> Chunk:

@@ -19,7 +19,7 @@ from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
 from .opening import ControlsConfig, EnvironmentConfig
-from .progress import Progress, Report, duration, silent, stage
+from .progress import Progress, Report, duration, silent, stage, stopping_with
 from .recording_facts import describe, recording_facts
 from .results import changed_settings, command, jsonable
 from .score import QUICK_HORIZONS, ExamRequest, arms_of, exam_of, write_card
@@ -144,10 +144,9 @@ class _Learning:
         """One stage. All share one bar, that of the minutes."""
         schedule = self.schedule
         try:
-            with schedule.stage(name, shown) as report:
+            stopped = f"stopped while {name}; the same command continues."
+            with stopping_with(stopped), schedule.stage(name, shown) as report:
                 facts = work(report)
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(str(stop) or f"stopped while {name}; the same command continues.") from stop
         except Exception:
             schedule.forget()
             raise

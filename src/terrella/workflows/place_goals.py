@@ -57,8 +57,9 @@ class PlaceGoals:
                     raise
                 seen = real.render(real.start(1, make_rng(own)), criterion.channels)
                 played.append(PlayedEpisode(success=False, nearest=float(criterion.distance(real, seen)[0])))
-            except KeyboardInterrupt:
-                raise PlayInterrupted(PlayResult(played, skipped)) from None
+            except KeyboardInterrupt as stop:
+                begun = stop.begun if isinstance(stop, PlayInterrupted) else ()
+                raise PlayInterrupted(PlayResult(played, skipped), begun) from None
             report(number + 1, episodes)
         return PlayResult(played, skipped)
 

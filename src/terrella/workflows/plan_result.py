@@ -113,7 +113,7 @@ def _lines(
         lines.append(f"a decision takes {ms.value:.0f} ms (95% within {ms.high:.0f}){imagined}")
     if skipped := played.planner.skipped:
         lines.append(f"{skipped} starts were already solved and left out")
-    if (study.goal or study.places) and planner.get("success") and not planner["success"].value:
+    if (study.goal or study.places) and planner.get("success") and not planner["success"].value and not played.cut:
         lines.append(_never_reached(study, episodes))
     measure = "success" if "success" in planner else "return"
     curve = played.curve
@@ -122,7 +122,9 @@ def _lines(
         lines.append(conclusion(played.curve, measure, study.config.seed))
     if study.search.budget_ms is not None:
         lines.append("planned by the clock: another run may differ")
-    if played.stopped:
+    if played.cut:
+        lines.append(f"stopped: these are the first {played.cut} of at most {study.steps} steps of each episode")
+    elif played.stopped:
         lines.append(f"stopped: {len(episodes)} of {study.config.episodes} episodes are done")
     return lines
 

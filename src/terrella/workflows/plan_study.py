@@ -83,6 +83,7 @@ class PlannedEpisodes:
     random: PlayResult | None = None  # Random actions from the same starts; None if it was stopped before.
     curve: tuple[CurvePoint, ...] = ()  # The planner with ever more compute.
     stopped: bool = False  # Whether Ctrl-C ended it early.
+    cut: int = 0  # Where all were played at once when it was stopped: the steps that they had done.
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,7 @@ class PlanStudy:
         try:
             played = self._planned(self.search, what, tuple(dict.fromkeys(kept)))
         except PlayInterrupted as stop:
-            if not stop.done.episodes:
-                raise KeyboardInterrupt("stopped before the first episode was done.") from None
-            return PlannedEpisodes(stop.done, stopped=True)
+            return self._stopped(stop)
         random, points = None, list[CurvePoint]()
         try:
             policy = Random(self.real.spec)
@@ -133,6 +132,23 @@ class PlanStudy:
         except KeyboardInterrupt:
             return PlannedEpisodes(played, random, tuple(points), stopped=True)
         return PlannedEpisodes(played, random, tuple(points))
+
+    def _stopped(self, stop: PlayInterrupted) -> PlannedEpisodes:
+        """The episodes that are done. Where all are played at once: their steps so far, beside random ones from the same starts,
+        for those that are over sooner are no fair sample."""
+        if stop.done.episodes:
+            return PlannedEpisodes(stop.done, stopped=True)
+        if not stop.begun:
+            raise KeyboardInterrupt("stopped before the first decision.") from None
+        count, cut = len(stop.begun), max(episode.steps for episode in stop.begun)
+        begun, random = PlayResult(stop.begun, stop.done.skipped), None
+        try:
+            if not self.places:
+                beside = replace(self, steps=cut)._play(Random(self.real.spec), "acting at random")
+                random = replace(beside, episodes=beside.episodes[:count])
+        except KeyboardInterrupt:
+            pass
+        return PlannedEpisodes(begun, random, stopped=True, cut=cut)
 
     def _add_point(self, points: list[CurvePoint], config: SearchConfig, whole: PlayResult) -> None:
         """The same starts with less compute. No point where a search imagines nothing."""

@@ -33,7 +33,7 @@ from .learn import check_budget
 from .learn_schedule import folder_for, refuse_foreign_folder, refuse_other_settings
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, TRIAL_FRAMES, slower
 from .opening import EnvironmentConfig
-from .progress import Progress, Report, silent, stage
+from .progress import Progress, Report, silent, stage, stopping_with
 from .results import jsonable
 from .train_policy import PolicyTrial, try_policy
 
@@ -109,10 +109,8 @@ def practise(
     done = rounds.resume()
     for number in range(len(done), ROUNDS):
         progress(f"Round {number + 1} of {ROUNDS}, in {rounds.folder}.")
-        try:
+        with stopping_with("stopped; the same command continues."):
             done.append(_round(rounds, done, environment, real, config, progress))
-        except KeyboardInterrupt as stop:
-            raise KeyboardInterrupt(str(stop) or "stopped; the same command continues.") from stop
         rounds.note(done)
         progress(_round_line(done[-1]))
     trials = {}

@@ -87,3 +87,12 @@ def _left(seconds: float) -> str:
 def duration(seconds: float) -> str:
     """A time for people: 45 s, 2.5 min."""
     return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{max(seconds, 0.0):.0f} s"
+
+
+@contextmanager
+def stopping_with(sentence: str) -> Iterator[None]:
+    """A context in which Ctrl-C says this sentence, if nothing inside says more."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        raise KeyboardInterrupt(str(stop) or sentence) from stop

@@ -38,7 +38,7 @@ from ..measure import (
 )
 from ..version import __version__
 from .opening import Device, Fast, device_of, load_named
-from .progress import Progress, Report, silent, stage
+from .progress import Progress, Report, silent, stage, stopping_with
 from .results import jsonable
 
 CONTEXT = 10  # frames that a world observes before it predicts: longer than the effect of a key lasts
@@ -115,7 +115,8 @@ def score(world: str | Path, config: ScoreConfig, *, progress: Progress = silent
     if config.quick and config.clips is None:
         exam = exam.of(most_clips_within(exam, QUICK_S, range(2, QUICK_CLIPS + 1)) or 2)
     identity += f" fast={config.fast} device={device_of(config.device)}"
-    with stage("scoring", progress) as report:
+    kept = f"stopped: the figures so far are kept in {config.out}; the same command continues."
+    with stopping_with(kept), stage("scoring", progress) as report:
         card, files = write_card(name, exam, identity, Path(config.out), report)
     return ScoreResult(card, tuple(files))
 

@@ -23,7 +23,7 @@ from ..measure.transfer_scores import (
     table,
     verdict,
 )
-from .progress import Progress, silent
+from .progress import Progress, silent, stopping_with
 from .results import changed_settings, jsonable, table_lines
 from .transfer_arms import run_seed
 from .transfer_experiment import DIAL, TransferExperiment, check_pair, check_robot, claim_folder, looks_hash, robot_hash
@@ -119,10 +119,11 @@ def transfer(
     progress(f"the real one is frozen: sha256 {experiment.hash}")
     seeds = range(config.seed, config.seed + config.seeds)
     run = partial(run_seed, experiment, folder, progress)
-    if config.workers == 1 or len(seeds) == 1:
-        return _result(experiment, folder, {seed: run(seed) for seed in seeds})
-    with ProcessPoolExecutor(config.workers, get_context("spawn")) as pool:
-        return _result(experiment, folder, dict(zip(seeds, pool.map(run, seeds))))
+    with stopping_with(f"stopped: the arms that are done are kept in {folder}; the same command continues."):
+        if config.workers == 1 or len(seeds) == 1:
+            return _result(experiment, folder, {seed: run(seed) for seed in seeds})
+        with ProcessPoolExecutor(config.workers, get_context("spawn")) as pool:
+            return _result(experiment, folder, dict(zip(seeds, pool.map(run, seeds))))
 
 
 def _experiment(config: TransferConfig) -> TransferExperiment:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -87,11 +88,12 @@ class PlaySettings:
 
 
 class PlayInterrupted(KeyboardInterrupt):
-    """Ctrl-C while episodes are played; `done` holds those that were over."""
+    """Ctrl-C while episodes are played. done: the batches that were over. begun: the episodes of the batch that was not, over or
+    not: of some the end, of others the steps so far."""
 
-    def __init__(self, done: PlayResult):
+    def __init__(self, done: PlayResult, begun: Sequence[PlayedEpisode] = ()):
         super().__init__()
-        self.done = done
+        self.done, self.begun = done, [episode for episode in begun if episode.steps]
 
 
 def play(
@@ -105,7 +107,7 @@ def play(
     """Plays `episodes` episodes, each until it succeeds, ends or is `steps` long. Starts that already succeed are skipped.
 
     The same seed gives the same starts whatever the policy, so that two policies can be compared in pairs. If states are values,
-    all episodes are played at once, else one after the other. progress(done, episodes) is called after each batch.
+    all episodes are played at once, else one after the other. progress(done, episodes) is called after each step.
     PlanningError if nearly every start already succeeds; PlayInterrupted on Ctrl-C.
     """
     criterion, spec, starts = settings.criterion, world.spec, make_rng(seed)
@@ -126,22 +128,37 @@ def play(
                     continue
                 state = state.at((~succeeded).nonzero()[:, 0]) if succeeded.any() else state
             kept = replace(settings, keep_episodes=max(0, settings.keep_episodes - len(played)))
-            played += play_from(world, state, policy, kept, seed + 1 + len(played) + skipped)
+            report = None if progress is None else partial(_within, progress, len(played), state.batch, episodes)
+            played += play_from(world, state, policy, kept, seed + 1 + len(played) + skipped, report)
             if progress:
                 progress(len(played), episodes)
-    except KeyboardInterrupt as stop:
-        done = stop.done.episodes if isinstance(stop, PlayInterrupted) else []
-        raise PlayInterrupted(PlayResult(played + done, skipped)) from None
+    except PlayInterrupted as stop:
+        raise PlayInterrupted(PlayResult(played, skipped), stop.begun) from None
+    except KeyboardInterrupt:
+        raise PlayInterrupted(PlayResult(played, skipped)) from None
     return PlayResult(played, skipped)
 
 
-def play_from(world: World, state: State, policy: Policy, settings: PlaySettings, seed: int = 0) -> list[PlayedEpisode]:
-    """The episodes that begin in `state`. The policy's random draws are the same in any world, as long as no episode ends."""
+def _within(progress: Callable[[float, float], None], before: int, batch: int, episodes: int, share: float) -> None:
+    progress(before + batch * share, episodes)
+
+
+def play_from(
+    world: World,
+    state: State,
+    policy: Policy,
+    settings: PlaySettings,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> list[PlayedEpisode]:
+    """The episodes that begin in `state`. The policy's random draws are the same in any world, as long as no episode ends.
+    progress(share of the steps) is called after each step."""
     sees = observed_channels(policy, world.spec) if settings.sees is None else settings.sees
     outcome = [name for name in ("reward", "done") if name in world.spec.channels]
     world.spec.check_channels((*settings.criterion.channels, *sees, *settings.keep))
     channels = tuple(dict.fromkeys((*sees, *settings.criterion.channels, *outcome)))
-    return _Batch(world, policy, settings, channels).play(state, *(make_rng(seed ^ stream) for stream in _STREAMS))
+    streams = (make_rng(seed ^ stream) for stream in _STREAMS)
+    return _Batch(world, policy, settings, channels, progress).play(state, *streams)
 
 
 @dataclass
@@ -152,6 +169,7 @@ class _Batch:
     policy: Policy
     settings: PlaySettings
     channels: tuple[str, ...]  # rendered after each step
+    progress: Callable[[float], None] | None = None
 
     @torch.no_grad()
     def play(
@@ -164,7 +182,9 @@ class _Batch:
         for episode, away in zip(episodes, criterion.distance(self.world, seen).tolist() if criterion.goal else []):
             episode.nearest = away
         try:
-            for _ in range(self.settings.steps):
+            for step in range(self.settings.steps):
+                if self.progress:
+                    self.progress(step / self.settings.steps)
                 self._keep(episodes, going, state)
                 began = time.perf_counter()
                 action, memory = act(self.policy, seen, memory, state.batch, self.world.spec, action_rng)
@@ -183,8 +203,7 @@ class _Batch:
                     state, memory = state.at(rows.to(state.device)), _memory_at(memory, rows)
                     seen = {name: value[rows.to(value.device)] for name, value in seen.items()}
         except KeyboardInterrupt:
-            done = [episode for number, episode in enumerate(episodes) if number not in going]
-            raise PlayInterrupted(PlayResult(done, 0)) from None
+            raise PlayInterrupted(PlayResult([], 0), episodes) from None
         self._keep(episodes, going, state)
         return episodes
 
