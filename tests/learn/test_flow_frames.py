@@ -18,13 +18,14 @@ from terrella.learn.moves import stitch_episodes
 from terrella.learn.objectives.codec import Spans
 from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
 from terrella.learn.recipes.video import train_video
+from terrella.learn.recipes.video_flat import codec_statistics, scrolls_of
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import TrainStep
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world
 
-SIZE, FLAT = (24, 32), replace(BARE, geometry=False, generator="flow", steps=12)
+SIZE, FLAT = (24, 32), replace(BARE, geometry=False, generator="flow", steps=32)
 MOVES = torch.tensor([[0, 0], [-2, 0], [2, 0]])
 
 
@@ -78,6 +79,23 @@ def test_some_clips_see_no_memory_some_all_and_some_what_the_last_frame_showed(r
     assert not part[..., -2:].any() and (part[:, 2:, :-2] > 0).all(), "the two columns that enter are new"
 
 
+def test_a_moving_paddle_does_not_scroll_the_picture(recording, tmp_path):
+    """In a walled field a paddle and two balls move; the other recording scrolls."""
+    with Recorder(tmp_path / "set", layout_of(10.0, ("right",), rgb=SIZE)) as recorder:
+        for row in range(120):
+            picture = np.full((*SIZE, 3), 40, np.uint8)
+            picture[:2] = picture[:, :2] = picture[:, -2:] = 120
+            picture[20:23, (x := 4 + 2 * abs(row % 18 - 9)) : x + 7] = (230, 160, 60)
+            for ball in range(2):
+                y, x = 4 + abs((row * (1 + ball)) % 24 - 12), 4 + abs((2 * row + 9 * ball) % 48 - 24)
+                picture[y : y + 4, x : x + 4] = 255
+            recorder.add({"rgb": picture}, np.array([row % 18 < 9]) if row < 119 else None, 0.0, False)
+        recorder.end_episode()
+    walled = Recording.open(tmp_path / "set", SIZE, quiet)
+    assert len(scrolls_of(walled, codec_statistics(walled, 0), 0)) == 1
+    assert len(scrolls_of(recording, codec_statistics(recording, 0), 0)) == 3
+
+
 def learned(share: float) -> list[float]:
     """Losses of drafts of a dot that moves by two pixels, before and after 60 gradient steps."""
     torch.manual_seed(0)
@@ -113,7 +131,7 @@ def flow_run(scrolling, tmp_path_factory):
 def test_a_world_of_a_scrolling_recording_knows_its_ground(flow_run):
     out, facts = flow_run
     world = load_world(out / "world")
-    assert facts["step"] == 12 and world.generator.kind == "flow"
+    assert facts["step"] == 32 and world.generator.kind == "flow"
     assert [-2, 0] in world.generator.moves.tolist() and [2, 0] in world.generator.moves.tolist()
     assert (world.scene.ground[3] > 0).float().mean() > 0.9 and world.scene.ground.shape[2] >= 110
     assert "batches" in check_world(world)

@@ -47,7 +47,7 @@ class FlowFeatures(NamedTuple):
 
     maps: tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # at 1/4, 1/8 and 1/16 of the size
     embedding: torch.Tensor  # [B, WIDE] of the actions
-    base: torch.Tensor  # [B, 3, H, W] in -1..1: the last frame, or `carried` where pictures scroll
+    base: torch.Tensor  # [B, 3, H, W] in -1..1: the last frame, or `carry` of it where pictures scroll
     older: torch.Tensor  # [B, 3, H, W]: the frame before
 
 
@@ -83,8 +83,8 @@ class FlowNetwork(nn.Module):
         self.scrolling = Scroll(config) if config.moves else None
         self.actions = nn.Sequential(nn.Linear(config.context, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE), nn.SiLU())
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE))
-        self.enter = nn.Conv2d(3 * config.slots * SQUARE**2, fine, 3, padding=1)
-        self.enter_drawn = nn.Conv2d((6 + 4 * (config.moves > 0)) * SQUARE**2, fine, 3, padding=1)
+        self.enter = nn.Conv2d(3 * config.slots, fine, SQUARE, stride=SQUARE)
+        self.enter_drawn = nn.Conv2d(6 + 4 * (config.moves > 0), fine, SQUARE, stride=SQUARE)
         self.before = nn.ModuleList(AdaptiveBlock(width) for width in config.channels)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in ((fine, middle), (middle, coarse)))
         self.attention = nn.MultiheadAttention(coarse, HEADS, batch_first=True)
@@ -92,7 +92,7 @@ class FlowNetwork(nn.Module):
         self.down_drawn = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in ((fine, middle), (middle, coarse)))
         self.after = nn.ModuleList(AdaptiveBlock(width) for width in (coarse, middle, fine, fine))
         self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in ((middle, coarse), (fine, middle)))
-        self.detail = nn.Conv2d(fine, DETAIL * SQUARE**2, 3, padding=1)
+        self.detail = nn.Conv2d(fine, DETAIL * SQUARE**2, 1)
         self.near = nn.Conv2d(DETAIL + 9, 24, 3, padding=1)
         self.output = nn.Conv2d(24, 3, 3, padding=1)
         nn.init.zeros_(self.output.weight)  # untrained, the last frame stays
@@ -108,13 +108,13 @@ class FlowNetwork(nn.Module):
         """Of frames [B, slots, 3, H, W] in -1..1, the newest first, the context [B, n], by which move int64 [B] most of the picture
         goes on, and memory uint8 [B, 4, H, W]: colours of the next frame and whether (over 0) they are known."""
         embedding = self.actions(context)
-        fine = self.before[0](self.enter(self._squares(frames.flatten(1, 2))), embedding)
+        fine = self.before[0](self.enter(self._padded(frames.flatten(1, 2))), embedding)
         middle = self.before[1](self.down[0](fine), embedding)
         coarse = self.before[2](self.down[1](middle), embedding)
         tokens = coarse.flatten(2).transpose(1, 2)
         attended = self.attention(tokens, tokens, tokens, need_weights=False)[0]
         coarse = coarse + attended.transpose(1, 2).unflatten(2, coarse.shape[-2:])
-        base = frames[:, 0] if scroll is None else self.carried(frames[:, 0], scroll, memory)
+        base = frames[:, 0] if scroll is None else carry(frames[:, 0], scroll, self.moves, self.over, memory)
         return FlowFeatures((fine, middle, coarse), embedding, base, frames[:, min(1, frames.shape[1] - 1)])
 
     def clean(
@@ -125,7 +125,7 @@ class FlowNetwork(nn.Module):
         angle = time[:, None] * (2.0 ** torch.arange(FREQUENCIES, device=time.device)) * (math.pi / 2)
         embedding = embedding + self.time(torch.cat([angle.sin(), angle.cos()], 1))
         entering = [noisy - base, base, *([self._remembered(memory, base)] if self.config.moves else [])]
-        fine = self.drawn(fine + self.enter_drawn(self._squares(torch.cat(entering, 1))), embedding)
+        fine = self.drawn(fine + self.enter_drawn(self._padded(torch.cat(entering, 1))), embedding)
         middle = middle + self.down_drawn[0](fine)
         x = self.after[0](coarse + self.down_drawn[1](middle), embedding)
         x = self.after[1](middle + F.pixel_shuffle(self.up[0](x), 2), embedding)
@@ -144,37 +144,28 @@ class FlowNetwork(nn.Module):
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]) * ~self.over
-        seen = self.encode(conditioning.glimpse.rgb * 2 - 1, conditioning.context, scroll, memory)
+        x = self.sample(conditioning.glimpse.rgb * 2 - 1, conditioning.context, scroll, memory, noise[:, :3], steps)
+        return torch.cat([x, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
+
+    def sample(self, frames, context, scroll, memory, noise: torch.Tensor, steps: int) -> torch.Tensor:
+        """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. The rest: as in `encode`."""
+        seen = self.encode(frames, context, scroll, memory)
         time = torch.zeros(len(noise), device=noise.device)
         x = self.clean(seen, seen.base, time, memory)
         for step in range(1, steps):
             t = step / steps
-            x = self.clean(seen, (1 - t) * noise[:, :3] + t * x.clamp(-1, 1), time + t, memory)
+            x = self.clean(seen, (1 - t) * noise + t * x.clamp(-1, 1), time + t, memory)
         x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
         if memory is not None:
             known = memory[:, :3].float() / 127.5 - 1
             x = torch.where(_alike(x, known, RECALLED) & (memory[:, 3:] > 0), known, x)
-        return torch.cat([x, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
+        return x
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """With `scroll`, the move by which most of the picture goes on, where pictures scroll."""
         if self.scrolling is None:
             return conditioning
         return replace(conditioning, scroll=predicted_scroll(self.scrolling, conditioning, self.moves))
-
-    def carried(self, last: torch.Tensor, scroll: torch.Tensor, memory: torch.Tensor | None) -> torch.Tensor:
-        """Frames [B, 3, H, W] in -1..1 that went on by the moves `scroll` int64 [B]; what lies over them stays. What was outside of
-        them, or under what lies over them, is as it is remembered, else as at the nearest edge."""
-        height, width = self.config.size
-        along = self.moves[torch.where(self.over, 0, scroll[:, None, None])]  # [B, H, W, 2]
-        x = torch.arange(width, device=last.device) - along[..., 0]
-        y = torch.arange(height, device=last.device)[:, None] - along[..., 1]
-        place = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-        carried = last.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
-        if memory is None:
-            return carried
-        new = (x < 0) | (x >= width) | (y < 0) | (y >= height) | self.over.flatten()[place] & ~self.over
-        return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3].float() / 127.5 - 1, carried)
 
     def _remembered(self, memory: torch.Tensor | None, base: torch.Tensor) -> torch.Tensor:
         """Memory as maps [B, 4, H, W]: colours relative to the base, 0 where unknown, and whether known."""
@@ -183,13 +174,35 @@ class FlowNetwork(nn.Module):
         known = (memory[:, 3:] > 0).float()
         return torch.cat([(memory[:, :3].float() / 127.5 - 1 - base) * known, known], 1)
 
-    def _squares(self, maps: torch.Tensor) -> torch.Tensor:
-        """Maps [B, C, H, W] as squares [B, C * SQUARE**2, h, w], with replicated edges where a side is no multiple of 16."""
+    def _padded(self, maps: torch.Tensor) -> torch.Tensor:
+        """Maps [B, C, H, W] with replicated edges where a side is no multiple of 16."""
         height, width = self.config.size
         below, right = -height % (4 * SQUARE), -width % (4 * SQUARE)
         if below or right:
             maps = F.pad(maps, (0, right, 0, below), mode="replicate")
-        return F.pixel_unshuffle(maps, SQUARE).contiguous(memory_format=torch.channels_last)
+        return maps.contiguous(memory_format=torch.channels_last)
+
+
+def carry(
+    last: torch.Tensor,
+    scroll: torch.Tensor,
+    moves: torch.Tensor,
+    over: torch.Tensor,
+    memory: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Frames [B, 3, H, W] in -1..1 that went on by `moves` int64 [n, 2] of index `scroll` int64 [B]; what lies over them, bool
+    [H, W], stays. What was outside of them, or under what lies over them, is as it is remembered (memory: as in `encode`), else as
+    at the nearest edge."""
+    height, width = last.shape[-2:]
+    along = moves[torch.where(over, 0, scroll[:, None, None])]  # [B, H, W, 2]
+    x = torch.arange(width, device=last.device) - along[..., 0]
+    y = torch.arange(height, device=last.device)[:, None] - along[..., 1]
+    place = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+    carried = last.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
+    if memory is None:
+        return carried
+    new = (x < 0) | (x >= width) | (y < 0) | (y >= height) | over.flatten()[place] & ~over
+    return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3].float() / 127.5 - 1, carried)
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor, most: float) -> torch.Tensor:

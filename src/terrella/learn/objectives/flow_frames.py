@@ -10,9 +10,8 @@ import torch
 
 from ...space.matching import scroll_index
 from ...worlds.controls import Controls
-from ...worlds.flow import FlowNetwork
-from ...worlds.frame_history import glimpse_of_frames
-from ...worlds.generator import Conditioning, channels_last, context_thumbnail, pixels
+from ...worlds.flow import FlowNetwork, carry
+from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..moves import StitchedEpisodes
 from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
 from .codec import Spans
@@ -24,6 +23,7 @@ LATEST = 0.9  # the largest flow time in training
 # Parts of the clips that see no memory, and all of it; the others see what the last frame showed.
 BLIND, WHOLE = 0.4, 0.3
 RECORDED = 400  # gradient steps on recorded frames alone, before rollouts begin
+WARMUP = 300  # gradient steps
 LONE = 0.1  # the part of clips whose history is one frame repeated: play begins so, too
 
 
@@ -88,7 +88,7 @@ class FlowFrames:
         self.generator = channels_last(network)
         self.smooth = Ema(self.generator, 0.995)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
-        rate = warmup_cosine(learning_rate, 100, 0.02)
+        rate = warmup_cosine(learning_rate, WARMUP // spans.rollout, 0.02)
         self.learners = {"generator": adamw((self.generator,), rate, 1e-3, (0.9, 0.98), self.smooth)}
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
@@ -105,7 +105,7 @@ class FlowFrames:
                 scroll = scroll_index(shown[:, 0], truth, self.generator.moves)
             yield self._loss(shown, context, memory, scroll, truth, before, now)
             count = half if step + 1 < recorded.shape[1] else 0
-            drawn = self._drawn(shown[:count], context[:count], scroll, now) if count else truth[:0]
+            drawn = self._drawn(shown[:count], context, scroll, memory, now) if count else truth[:0]
             shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
 
     def _loss(self, shown, context, memory, scroll, truth, before, now: TrainStep) -> Loss:
@@ -114,7 +114,7 @@ class FlowFrames:
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
         base, was = frames[:, 0], before.float() / 127.5 - 1
         if scroll is not None:
-            base, was = network.carried(base, scroll, memory), network.carried(was, scroll, memory)
+            base, was = (carry(one, scroll, network.moves, network.over, memory) for one in (base, was))
         changes = (clean - was).abs().amax(1, keepdim=True) > CHANGED / 127.5
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
         frames = frames + level * now.randn(*frames.shape)
@@ -146,14 +146,13 @@ class FlowFrames:
             self.smooth.module.scrolling.load_state_dict(self.generator.scrolling.requires_grad_(False).state_dict())
 
     @torch.no_grad()
-    def _drawn(self, shown, context, scroll, now: TrainStep) -> torch.Tensor:
-        """Frames uint8 [B, 3, H, W] that follow those `shown` by the true scroll, drawn by the averaged weights in 1 step or more,
-        without memory."""
-        network = self.smooth.module
+    def _drawn(self, shown, context, scroll, memory, now: TrainStep) -> torch.Tensor:
+        """Frames uint8 [B, 3, H, W] that follow the B histories `shown` by the true scroll, drawn by the averaged weights in 1 step
+        or more."""
+        network, batch = self.smooth.module, len(shown)
         steps = 1 + int(now.rng.integers(network.config.steps)) * (now.share > DRAFTS)
-        noise = now.randn(len(shown), 4, *network.config.size)
-        scroll = None if scroll is None else scroll[: len(shown)]
-        given = Conditioning(glimpse_of_frames(shown), noise, context, scroll=scroll)
+        scroll, memory = (None if each is None else each[:batch] for each in (scroll, memory))
+        noise = now.randn(batch, 3, *network.config.size)
         with now.half():
-            clean = network.draw(noise, given, steps)
-        return pixels(clean.float())
+            drawn = network.sample(shown.float() / 127.5 - 1, context[:batch], scroll, memory, noise, steps)
+        return pixels(drawn.float())

@@ -15,7 +15,7 @@ from ...space.mosaic import read_mosaic
 from ...worlds.codec import COARSE, Codec, CodecConfig
 from ...worlds.config import VideoConfig
 from ...worlds.controls import Controls
-from ...worlds.flow import FlowConfig, FlowNetwork
+from ...worlds.flow import FlowConfig, FlowNetwork, carry
 from ...worlds.frame_history import FrameHistory, StartClips
 from ...worlds.generator import pixels
 from ...worlds.learned import LearnedWorld
@@ -41,8 +41,8 @@ MOVES, COLOURS = 24, 64  # sizes of a codec's vocabularies
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
 QUARTER = 0.25
 ONE_FRAME = "--frames 1: how things move is seen in two frames; give 2 or more."
-SCROLLS = 0.01  # see `scrolls_of`
-FLOW_ROLLOUT = 3  # steps of a clip that a flow network predicts
+SCROLLS, HALF = 0.01, 0.5  # see `scrolls_of`
+FLOW_ROLLOUT = 8  # steps of a clip that a flow network predicts
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE, MAX_STRESS = (
     0.4,
@@ -243,14 +243,22 @@ def _statistics_of(parts: VideoParts) -> CodecStatistics:
 
 def scrolls_of(recording: Recording, statistics: CodecStatistics, seed: int) -> torch.Tensor:
     """The moves by which whole pictures scroll, int64 [n, 2], (0, 0) first: those that lead from SCROLLS of the pictures or more
-    to the next."""
+    to the next, and after which at most HALF as many pixels differ. A paddle that moves does not scroll the picture."""
     rows = recording.rows_within(1, 0)
     rows = np.sort(np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False))
+    before, after = recording.rgb(rows - 1), recording.rgb(rows)
     moves = F.pad(statistics.moves, (0, 0, 1, 0))
-    count = torch.bincount(scroll_index(recording.rgb(rows - 1), recording.rgb(rows), moves), minlength=len(moves))
-    often = count >= SCROLLS * len(rows)
-    often[0] = True
-    return moves[often]
+    index = scroll_index(before, after, moves)
+    still = changed_pixels(before, after).mean((1, 2))
+    carried = changed_pixels(pixels(carry(before.float() / 127.5 - 1, index, moves, statistics.over)), after).mean(
+        (1, 2)
+    )
+    often = [
+        number == 0 or len(at) >= SCROLLS * len(rows) and carried[at].mean() <= HALF * still[at].mean()
+        for number in range(len(moves))
+        for at in [(index == number).nonzero()[:, 0]]
+    ]
+    return moves[torch.tensor(often)]
 
 
 def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
@@ -260,10 +268,15 @@ def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
     rows = np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False)
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
     if network.scrolling is not None:
-        carried = network.carried(before.float() / 127.5 - 1, scroll_index(before, after, network.moves), None)
-        before = pixels(carried)
-    change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean()
+        index = scroll_index(before, after, network.moves)
+        before = pixels(carry(before.float() / 127.5 - 1, index, network.moves, network.over))
+    change = changed_pixels(before, after).mean()
     return float(np.clip(CHANGED_SHARE / max(float(change), 1e-4), 1, MAX_STRESS))
+
+
+def changed_pixels(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """1 where pictures uint8 [B, 3, H, W] differ by more than 8 of 255, else 0: float [B, H, W]."""
+    return ((before.int() - after.int()).abs().amax(1) > 8).float()
 
 
 def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS) -> CodecStatistics:
@@ -273,7 +286,7 @@ def codec_statistics(recording: Recording, seed: int, pixels: int = PAIR_PIXELS)
     rows = recording.rows_within(1, 0)
     rows = np.sort(rng.choice(rows, min(len(rows), 2000), replace=False))
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
-    change = ((before.int() - after.int()).abs().amax(1) > 8).float().mean((1, 2)).numpy() + 1e-4
+    change = changed_pixels(before, after).mean((1, 2)).numpy() + 1e-4
     most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
     some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
     moves, colours = frequent_moves(before[some], after[some], MOVES), palette(after, COLOURS, rng)
