@@ -13,7 +13,8 @@ from ...worlds.controls import Controls
 from ...worlds.flow import FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..moves import StitchedEpisodes
-from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
+from ..muon import muon
+from ..trainer import Ema, Loss, TrainStep, warmup_cosine
 from .codec import Spans
 
 NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
@@ -89,7 +90,7 @@ class FlowFrames:
         self.smooth = Ema(self.generator, 0.995)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         rate = warmup_cosine(learning_rate, WARMUP // spans.rollout, 0.02)
-        self.learners = {"generator": adamw((self.generator,), rate, 1e-3, (0.9, 0.98), self.smooth)}
+        self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
         slots = self.generator.config.slots

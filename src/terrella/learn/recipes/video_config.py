@@ -43,7 +43,7 @@ class TrainConfig:
     hours: float = 24.0
     # Frames per step. Default: 8 on a CPU, 64 on a GPU.
     batch: int | None = None
-    # Peak learning rate of the generator. Default: 8e-4, and without depth 2e-3.
+    # Peak learning rate of the generator. Default: 8e-4, and without depth 2e-3 (flow: 6e-3).
     learning_rate: float | None = None
     motion_steps: int = 6000  # Training steps of the motion model.
     keyframes: int = 640  # Number of recorded keyframes that the world keeps in memory.

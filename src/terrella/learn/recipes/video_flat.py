@@ -139,7 +139,7 @@ class FlowRecipe:
         network.moves[:], network.over[:] = moves, self.over & (len(moves) > 1)
         spans = Spans.fitting(_lengths(recording), self.video.slots, 0, FLOW_ROLLOUT)
         self.objective = FlowFrames(
-            network, config.learning_rate or 1.2e-3, spans, stress_of(recording, network, config.seed)
+            network, config.learning_rate or 6e-3, spans, stress_of(recording, network, config.seed)
         )
         self.stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
         self.ground = None if self.stitched is None else joined(list(self.stitched.grounds.values()))
