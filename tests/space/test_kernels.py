@@ -13,7 +13,8 @@ from terrella.space.camera import FAR_M, planar_pose, rotation
 from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
 from terrella.space.kernels_numba.recall import pick as pick_kernel
 from terrella.space.keyframes import ANYWAY, Keyframes, pick_slowly
-from terrella.space.patches import cast_slowly, patches
+from terrella.space.patches import cast as cast_boxes
+from terrella.space.patches import patches
 from terrella.space.reproject import (
     carry_things,
     carry_things_slowly,
@@ -24,7 +25,7 @@ from terrella.space.reproject import (
 )
 from terrella.space.views import arrays, each_view, over_views
 
-from .rooms import cast
+from .rooms import cast, cast_slowly
 
 CAMERA = (0.5, 0.667, 0.5, 0.5)
 
@@ -57,10 +58,11 @@ def test_patches_at_the_rim_are_not_lost(camera):
     sides = torch.randn(400, 6, generator=rng) * torch.rand(400, 1, generator=rng) * 2
     patch = torch.cat([centre, sides], 1)[None]
     for pose in poses(4, rng):
-        quick, slow = (way(patch, pose[None], camera, (24, 32)) for way in (cast, cast_slowly))
+        quick, slow, boxes = (way(patch, pose[None], camera, (24, 32)) for way in (cast, cast_slowly, cast_boxes))
         assert (slow < FAR_M).float().mean() > 0.3
         close = torch.isclose(quick, slow, rtol=1e-3, atol=1e-3)
         assert float(close.float().mean()) > 0.995, "but for pixels on the very edge of a patch"
+        assert float(torch.isclose(boxes, quick, rtol=1e-4).float().mean()) > 0.995, "small ones and large ones"
 
 
 def pick(votes: torch.Tensor, count: int) -> torch.Tensor:

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from terrella.space.camera import planar_pose, project, unproject, yaw
 from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
 from terrella.space.keyframes import Keyframes, doubled, gathered, look, look_slowly, retrieve, retrieve_slowly
-from terrella.space.patches import FAR_M, cast_slowly, patches, patches_slowly
+from terrella.space.patches import FAR_M, patches, patches_slowly
 from terrella.space.reproject import fill_holes, warp
 
-from .rooms import CAMERA, SIZE, cast, painted, pose_at, room_depth
+from .rooms import CAMERA, SIZE, cast, cast_slowly, painted, pose_at, room_depth
 
 
 def keyframe(x: float, y: float, heading: float) -> Keyframes:

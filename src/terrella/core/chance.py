@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import torch
 
+from .backend import kernels_do
 from .kernels_numba import halves
 
 GOLDEN, FIRST, SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15  # of splitmix64, as signed 64 bit
@@ -48,7 +49,7 @@ def choice(seeds: torch.Tensor, probabilities: torch.Tensor, stream: int = 0) ->
 
 def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The upper and the lower half of `count` hashes of each seed, as float32 [B, count] in [0, 1), multiples of 2**-24."""
-    if seeds.device.type != "cpu":
+    if not kernels_do(seeds):
         return _halves_slowly(seeds, count, stream)
     high, low = torch.empty(2, len(seeds), count).unbind(0)
     halves(seeds.contiguous().numpy(), stream, high.numpy(), low.numpy())

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
+from ..core.backend import kernels_do
 from .camera import Intrinsics, project
 from .kernels_numba.paint import TOUCHED, paint_views
 from .views import arrays, over_views
@@ -82,7 +83,7 @@ def paint_billboards(
 
     rgb and depth are the background; billboards = places [B, K, 3], pictures [B, K, 4, *PICTURE], boxes [B, K, 4]; present [B, K]
     bool."""
-    if rgb.device.type != "cpu":
+    if not kernels_do(rgb):
         return paint_billboards_slowly(rgb, depth, billboards, present, pose, camera)
     order, present, sides, far = _placed(billboards, present, pose, camera, depth.shape[-2:])
     rgb, onto, instances = rgb.clone(), depth.clone(), torch.zeros(depth.shape, dtype=torch.uint8)
@@ -111,28 +112,32 @@ def _placed(billboards, present, pose, camera, size) -> tuple[torch.Tensor, ...]
 def paint_billboards_slowly(
     rgb, depth, billboards, present, pose, camera
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The same as `paint_billboards`, in plain tensor algebra, of all views one billboard at a time; also for GPUs."""
-    height, width = depth.shape[-2:]
+    """The same as `paint_billboards`, in plain tensor algebra, all billboards of all views at once; also for GPUs."""
+    (batch, height, width), count = depth.shape, billboards[0].shape[1]
     order, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
-    pictures = billboards[1]
-    hides, instances = depth + BEHIND_M, torch.zeros_like(depth, dtype=torch.uint8)
-    quarters = torch.tensor([0.25, 0.75], device=rgb.device)
-    # two samples along each side of a pixel
-    u = (torch.arange(width, device=rgb.device)[:, None] + quarters).flatten()
-    v = (torch.arange(height, device=rgb.device)[:, None] + quarters).flatten()
-    for rank in order.unbind(1):
-        view = torch.arange(len(rgb), device=rgb.device)
-        left, right, top, bottom = sides[view, rank].clamp(-1e6, 1e6)[..., None].unbind(1)
-        a, b = (u - left) / (right - left).clamp_min(1e-6), (v - top) / (bottom - top).clamp_min(1e-6)
-        grid = torch.stack(torch.broadcast_tensors(a[:, None] * 2 - 1, b[:, :, None] * 2 - 1), -1)
-        drawn = F.grid_sample(pictures[view, rank], grid, padding_mode="border", align_corners=False)
-        mask = (drawn[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1)[:, None]
-        shown = (far[view, rank][:, None, None] < hides) & present[view, rank][:, None, None]
-        cover = F.avg_pool2d(mask.float(), 2) * shown[:, None]
-        rgb = rgb * (1 - cover) + F.avg_pool2d(drawn[:, :3] * mask, 2) * shown[:, None]
-        depth = torch.where(cover[:, 0] > 0.5, far[view, rank][:, None, None], depth)
-        instances = torch.where(cover[:, 0] > TOUCHED, (rank + 1)[:, None, None].to(torch.uint8), instances)
-    return rgb, depth, instances
+    pictures = billboards[1].flatten(0, 1)
+    quarters = torch.arange(2 * max(height, width), device=rgb.device) / 2 + 0.25  # two samples along each side of a pixel
+    left, right, top, bottom = sides.clamp(-1e6, 1e6)[..., None].unbind(2)
+    across = (quarters[: 2 * width] - left) / (right - left).clamp_min(1e-6) * 2 - 1
+    down = (quarters[: 2 * height] - top) / (bottom - top).clamp_min(1e-6) * 2 - 1
+    grid = torch.stack(torch.broadcast_tensors(across[:, :, None], down[..., None]), -1)
+    drawn = F.grid_sample(pictures, grid.flatten(0, 1), padding_mode="border", align_corners=False)
+    mask = (drawn[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1).flatten(0, 1)[:, None]
+    small = F.avg_pool2d(torch.cat([drawn[:, :3] * mask, mask.float()], 1), 2).unflatten(0, (batch, count))
+    shown = (far[..., None, None] < (depth + BEHIND_M)[:, None]) & present[..., None, None]
+    small = small * shown[:, :, None]
+    # the nearest last; what is left of each after those before it
+    turn = order[..., None, None, None].expand_as(small)
+    small, far = small.gather(1, turn), far.gather(1, order)
+    colour, cover = small[:, :, :3], small[:, :, 3]
+    left = F.pad((1 - cover).flip(1).cumprod(1), (0, 0, 0, 0, 1, 0), value=1.0).flip(1)
+    rgb = rgb * left[:, :1] + (colour * left[:, 1:, None]).sum(1)
+    ranks = torch.arange(1, count + 1, device=rgb.device)[:, None, None]
+    onto, touched = (((cover > least) * ranks).amax(1) for least in (0.5, TOUCHED))
+    depths, numbers = F.pad(far, (1, 0)), F.pad(order + 1, (1, 0))
+    nearest = depths.gather(1, onto.flatten(1)).view_as(depth)
+    instances = numbers.gather(1, touched.flatten(1)).view_as(depth).to(torch.uint8)
+    return rgb, torch.where(onto > 0, nearest, depth), instances
 
 
 def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,6 +5,8 @@ w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics ar
 
 import torch
 
+from ..core.backend import constant, table
+
 Intrinsics = tuple[float, float, float, float]
 
 NEAR_M = 0.05  # nearer surfaces are not drawn
@@ -29,13 +31,14 @@ _TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a unit qua
 
 def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tensor:
     """Directions through the pixel centres in the camera frame, scaled so that x (forward) is 1: float32 [H, W, 3]."""
+    return constant(_rays, torch.device(device or "cpu"), tuple(camera), height, width)
+
+
+def _rays(camera: Intrinsics, height: int, width: int) -> torch.Tensor:
     fx, fy, cx, cy = camera
-    u = (torch.arange(width, device=device) + 0.5) / width
-    v = (torch.arange(height, device=device) + 0.5) / height
+    u, v = (torch.arange(width) + 0.5) / width, (torch.arange(height) + 0.5) / height
     left, up = -(u - cx) / fx, -(v - cy) / fy
-    return torch.stack(
-        [torch.ones(height, width, device=device), left.expand(height, width), up[:, None].expand(height, width)], -1
-    )
+    return torch.stack([torch.ones(height, width), left.expand(height, width), up[:, None].expand(height, width)], -1)
 
 
 def rotation(pose: torch.Tensor) -> torch.Tensor:
@@ -43,7 +46,8 @@ def rotation(pose: torch.Tensor) -> torch.Tensor:
     quaternion = pose[..., 3:]
     quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     products = (quaternion[..., :, None] * quaternion[..., None, :]).flatten(-2)
-    return (products @ _TURN.to(pose)).unflatten(-1, (3, 3)) + _STAY.to(pose)
+    turn, stay = (constant(part.to, pose.device, pose.dtype) for part in (_TURN, _STAY))
+    return (products @ turn).unflatten(-1, (3, 3)) + stay
 
 
 def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
@@ -55,17 +59,16 @@ def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> to
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
     """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N]. Points
     behind the camera have depth <= 0 and meaningless coordinates."""
-    fx, fy, cx, cy = camera
     local = (points - pose[..., None, :3]) @ rotation(pose)
     depth = local[..., 0]
-    safe = depth.clamp_min(1e-4)
-    return torch.stack([cx - fx * local[..., 1] / safe, cy - fy * local[..., 2] / safe], -1), depth
+    focal, middle = (constant(table, depth.device, *pair) for pair in (camera[:2], camera[2:]))
+    return middle - focal * local[..., 1:] / depth.clamp_min(1e-4)[..., None], depth
 
 
 def yaw(pose: torch.Tensor) -> torch.Tensor:
     """Heading in radians, counter-clockwise from world x: [..., 7] -> [...]."""
     w, x, y, z = pose[..., 3:].unbind(-1)
-    return torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return torch.atan2(w * z + x * y, 0.5 - (y * y + z * z))
 
 
 def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:

@@ -1,9 +1,12 @@
 """Floor plans from depth images: straight walls at the camera's height, and bodies that slide along them. World frame, metres; a
 body is an axis-aligned upright box, as in Doom and Quake."""
 
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 
+from ..core.backend import constant, kernels_do, where
 from .camera import Intrinsics, unproject, yaw
 from .kernels_numba.walls import WITHIN_M
 from .kernels_numba.walls import slide as slide_kernel
@@ -50,7 +53,7 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
 def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
     """Runs of columns on which inverse depth [K, w] is linear in `left` [w] (float64 both), with neighbours less than GAP_M
     apart and depths below SEEN_M: [K, n, 4] = first, stop, slope, level; zeros after the last."""
-    if inverse.device.type != "cpu":
+    if not kernels_do(inverse):
         return straight_runs_slowly(inverse, left)
     runs = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
     each_view(straight_runs_kernel, arrays(inverse, runs), *arrays(left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
@@ -58,32 +61,47 @@ def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
 
 
 def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """The same as `straight_runs`: the longest run from every column, then a choice of runs from left to right."""
+    """The same as `straight_runs`, in plain tensor algebra, also for GPUs: lines through all runs at once, then the longest from
+    every column, and of these a choice from left to right."""
     count, width = inverse.shape
+    columns = torch.arange(width, device=inverse.device)
     near, far = 1 / inverse, left / inverse
     joins = (near.diff(dim=1).square() + far.diff(dim=1).square()).sqrt() <= GAP_M
     joins &= (inverse[:, 1:] >= 1 / SEEN_M) & (inverse[:, :-1] >= 1 / SEEN_M)
-    alive = torch.ones(count, width, dtype=torch.bool, device=inverse.device)
-    stop = torch.arange(1, width + 1, device=inverse.device).repeat(count, 1)
-    slope, level = torch.zeros_like(inverse), torch.zeros_like(inverse)
-    for length in range(2, width + 1):
-        x, y, starts = left.unfold(0, length, 1), inverse.unfold(1, length, 1), width - length + 1
-        middle, mean = x.mean(1, keepdim=True), y.mean(2, keepdim=True)
-        steep = ((x - middle) * (y - mean)).sum(2) / (x - middle).square().sum(1)
-        off = (steep[..., None] * (x - middle) + mean - y).abs().amax(2)
-        fits = alive[:, :starts] & joins[:, length - 2 :] & (off <= STRAIGHT * y.amax(2))
-        alive = F.pad(fits, (0, width - starts))
-        stop = stop + alive
-        slope = torch.where(alive, F.pad(steep, (0, width - starts)), slope)
-        level = torch.where(alive, F.pad(mean[..., 0] - steep * middle[:, 0], (0, width - starts)), level)
-    columns, turn = torch.arange(width, device=inverse.device), torch.zeros_like(stop[:, 0])
-    taken = torch.zeros_like(alive)
-    for column in range(width):
-        taken[:, column] = (turn == column) & (stop[:, column] - column >= FEWEST)
-        turn = torch.where(taken[:, column], stop[:, column], torch.maximum(turn, columns[column] + 1))
+    # [K, first, last] of runs from column `first` to column `last`; sums over them by differences of sums from the left
+    mean, middle, square, both = (_means(part) for part in (inverse, left, left.square(), left * inverse))
+    spread = (square - middle.square()).clamp_min(1e-12)
+    slope = (both - middle * mean) / spread
+    level = mean - slope * middle
+    within = (columns >= columns[:, None])[:, None] & (columns <= columns[:, None])  # [first, last, column]
+    off = (slope[..., None] * left + level[..., None] - inverse[:, None, None]).abs()
+    off = torch.where(within, off, 0.0).amax(-1)
+    most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
+    broken = F.pad((~joins).cumsum(1), (1, 0))
+    fits = (off <= STRAIGHT * most) & (broken[:, None] == broken[:, :, None]) & (columns > columns[:, None])
+    fits = fits | (columns == columns[:, None])
+    alive = fits.long().masked_fill(columns < columns[:, None], 1).cumprod(2)
+    stop = (alive * (columns >= columns[:, None])).sum(2) + columns
+    last = (stop - 1)[..., None]
+    slope, level = (part.gather(2, last)[..., 0] for part in (slope, level))
+    long = stop - columns >= FEWEST
+    # which columns a walk from the left comes to, by doubling its strides
+    onward = F.pad(torch.where(long, stop, columns + 1), (0, 1), value=width)
+    visited = F.pad(torch.ones_like(stop[:, :1]), (0, width))
+    for _ in range(width.bit_length()):
+        visited = visited.scatter_reduce(1, onward, visited, "amax")
+        onward = onward.gather(1, onward)
+    taken = long & (visited[:, :width] > 0)
     runs = torch.stack([columns.expand(count, -1).double(), stop.double(), slope, level], 2) * taken[..., None]
     order = (~taken).to(torch.uint8).argsort(dim=1, stable=True)[:, : width // FEWEST]
     return runs.gather(1, order[..., None].expand(-1, -1, 4))
+
+
+def _means(values: torch.Tensor) -> torch.Tensor:
+    """Means [..., first, last] of the values [..., w] from one column to another; meaningless where last < first."""
+    sums = F.pad(values.cumsum(-1), (1, 0))
+    columns = torch.arange(values.shape[-1], device=values.device)
+    return (sums[..., None, 1:] - sums[..., :-1, None]) / (columns - columns[:, None] + 1).clamp_min(1)
 
 
 def _corners(first, stop, slope, level, left) -> torch.Tensor:
@@ -171,7 +189,7 @@ def slide(
     and `own` walls [B, n, 4]. At a wall the rest of the motion continues along it, twice at most. A body stops `short` (a share of
     the wish) of a wall. Returns the displacement [B, 2] and the remaining motion, the momentum [B, 2]."""
     own = walls.new_zeros(len(places), 0, 4) if own is None else own
-    if places.device.type != "cpu":
+    if not kernels_do(places):
         return slide_slowly(walls, places, wish, half_m, short, own)
     went, left = torch.zeros(2, len(places), 2, dtype=torch.float64)
     parts = [*arrays(walls, own.to(walls), places.double(), wish.double()), half_m, short, went.numpy(), left.numpy()]
@@ -181,47 +199,74 @@ def slide(
 
 def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor, torch.Tensor]:
     """The same as `slide`, in plain tensor algebra, also for GPUs."""
-    whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1).double()
-    whole = F.pad(whole, (0, 0, 0, 1), value=NOWHERE)
+    whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1)
+    sides = _sides(F.pad(whole, (0, 0, 0, 1), value=NOWHERE).double(), half_m)
     place, rest = places.double(), wish.double()
-    free = torch.ones(len(places), 1, dtype=torch.bool, device=places.device)
+    free = torch.ones_like(place[:, :1], dtype=torch.bool)
     for bump in range(3):
-        share, along = _first_touch(whole - place.repeat(1, 2)[:, None], rest, half_m)
-        open_way, share = share[:, None] > 1, share[:, None]
-        go = torch.where(open_way, 1.0, (share - short).clamp_min(0))
-        place = torch.where(free, place + go * rest, place)
+        share, along = _first_touch(sides, place, rest)
+        blocked = share <= 1
+        go = where(blocked, (share - short).clamp_min(0), 1.0)
+        place = place + go * rest * free
         onward = (1 - share.clamp_min(0)) * (rest * along).sum(1, keepdim=True) * along * float(bump < 2)
-        rest, free = torch.where(free & ~open_way, onward, rest), free & ~open_way
-    return (place - places.double()).to(wish), rest.to(wish)
+        free = free & blocked
+        rest = torch.where(free, onward, rest)
+    return (place - places).to(wish), rest.to(wish)
 
 
-def _first_touch(walls: torch.Tensor, move: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """The share [B] of the move [B, 2] at which a box around the origin first touches a wall [B, S, 4] (2: none), and the
-    direction [B, 2] in which it can go on: see kernels_numba/walls.first_touch."""
-    a, b = walls.split(2, -1)
-    length = (b - a).norm(dim=-1, keepdim=True)
-    across = torch.stack([b[..., 1] - a[..., 1], a[..., 0] - b[..., 0]], -1) / length.clamp_min(1e-9)
-    unit = torch.stack(
-        [across.new_tensor([1.0, 0]).expand_as(across), across.new_tensor([0, 1.0]).expand_as(across), across], 2
-    )
-    one, other = (unit @ a[..., None])[..., 0], (unit @ b[..., None])[..., 0]  # [B, S, 3 axes]
+class _Sides(NamedTuple):
+    """Walls [B, S] by their separating axes x, y and across: the axes [B, S, 3, 2], how far along each lie the ends of a wall that is
+    a body's half width larger, low and high [B, S, 3]; the sines [B, S, 3, 3] of the angles between axes; real [B, S]."""
+
+    unit: torch.Tensor
+    low: torch.Tensor
+    high: torch.Tensor
+    crossing: torch.Tensor
+    real: torch.Tensor
+
+
+def _sides(walls: torch.Tensor, half: float) -> _Sides:
+    """Of walls [B, S, 4]."""
+    ends = walls.unflatten(-1, (2, 2))
+    along = ends[..., 1, :] - ends[..., 0, :]
+    length = along.norm(dim=-1, keepdim=True)
+    turn, plain, split = (constant(_doubles, walls.device, *rows) for rows in _AXES)
+    unit = torch.cat([plain.expand(*along.shape[:2], 2, 2), ((along @ turn) / length.clamp_min(1e-9))[..., None, :]], 2)
+    both = unit @ ends.mT  # [B, S, 3 axes, 2 ends]
     reach = half * unit.abs().sum(-1)
-    low, high = torch.minimum(one, other) - reach, torch.maximum(one, other) + reach
-    speed = (unit @ move[:, None, :, None])[..., 0]
-    moves = speed.abs() >= 1e-12
-    ends = torch.stack([low, high]) / torch.where(moves, speed, 1.0)
-    enter, face = torch.where(moves, ends.amin(0), -1e9).max(-1)
-    leave = torch.where(moves, ends.amax(0), torch.where((low >= -1e-9) | (high <= 1e-9), -1e9, 1e9)).amin(-1)
-    faced = unit.gather(2, face[..., None, None].expand(*face.shape, 1, 2))[:, :, 0]
-    pace = speed.gather(2, face[..., None])[..., 0].abs()
+    low, high = torch.aminmax(both, dim=-1)
+    crossing = (unit @ split @ unit.mT).abs()
+    return _Sides(unit, low - reach, high + reach, crossing, length[..., 0] >= 1e-9)
+
+
+_QUARTER = (0.0, -1.0), (1.0, 0.0)
+_AXES = _QUARTER, ((1.0, 0.0), (0.0, 1.0)), _QUARTER
+
+
+def _doubles(*rows) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _first_touch(sides: _Sides, place: torch.Tensor, move: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The share [B, 1] of the move [B, 2] at which a box at `place` [B, 2] first touches a wall (2: none), and the direction [B, 2]
+    in which it can go on: see kernels_numba/walls.first_touch."""
+    unit, low, high, crossing, real = sides
+    at, speed = (unit @ torch.stack([place, move], -1)[:, None]).unbind(-1)  # [B, S, 3]
+    low, high, pace = low - at, high - at, speed.abs()
+    still = pace < 1e-12
+    ends = torch.stack([low, high]) / speed.masked_fill(still, 1.0)
+    least, most = torch.aminmax(ends, dim=0)
+    enter, face = least.masked_fill(still, -1e9).max(-1)
+    beside = still & (torch.maximum(low, -high) >= -1e-9)
+    leave = most.masked_fill(still, 1e9).masked_fill(beside, -1e9).amin(-1)
     deep = torch.minimum(enter[..., None] * speed - low, high - enter[..., None] * speed)
-    crossing = (unit[..., 0] * faced[..., None, 1] - unit[..., 1] * faced[..., None, 0]).abs()
-    grazes = ((crossing > 0.02) & (deep < WITHIN_M)).any(-1)
-    meets = (enter < leave) & (enter <= 1) & (enter > -1e9) & (enter * pace > -WITHIN_M)
-    meets &= ~grazes & (length[..., 0] >= 1e-9)
-    share, which = torch.where(meets, enter, 2.0).min(1)
-    met = faced.gather(1, which[:, None, None].expand(-1, 1, 2))[:, 0]
-    return share, torch.stack([-met[:, 1], met[:, 0]], 1)
+    index = face[..., None]
+    across = crossing.gather(2, index[..., None].expand(*crossing.shape[:2], 1, 3))[:, :, 0]
+    grazes = ((across > 0.02) & (deep < WITHIN_M)).any(-1)
+    reaches = (enter < leave) & (enter <= 1) & (enter > -1e9) & (enter * pace.gather(2, index)[..., 0] > -WITHIN_M)
+    share, which = where(reaches & real & ~grazes, enter, 2.0).min(1, keepdim=True)
+    faced = unit.flatten(1, 2).gather(1, (3 * which + face.gather(1, which))[..., None].expand(-1, -1, 2))[:, 0]
+    return share, faced @ constant(_doubles, place.device, *_QUARTER).mT
 
 
 def horizon(camera: Intrinsics, height: int) -> int:

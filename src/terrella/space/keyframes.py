@@ -10,12 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
+import torch.nn.functional as F
 
-from .camera import FAR_M, SAME, Intrinsics, project, rays, rotation
+from ..core.backend import constant, kernels_do, table
+from .camera import FAR_M, NEAR_M, SAME, Intrinsics, project, rotation, unproject
 from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
-from .patches import SLANT, cast_slowly, patch_count, patches, patches_slowly
+from .patches import COARSE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
 from .reproject import fill_holes, warp
 from .views import arrays, over_views
 
@@ -124,7 +126,7 @@ def retrieve(
     there. Each pick adds most to the votes of the picks before it."""
     if own is None or rows is None:
         own, rows = Keyframes.none(size, pose.device), torch.zeros(len(pose), 0, dtype=torch.int64, device=pose.device)
-    if pose.device.type != "cpu":
+    if not kernels_do(pose):
         return retrieve_slowly(shared, pose, camera, size, count, own, rows)
     picks = torch.full((len(pose), count), -1)
     lots = (tuple(arrays(keys.coarse, keys.depth, keys.turn, keys.pose)) for keys in (shared, own))
@@ -136,49 +138,57 @@ def retrieve(
 
 def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tensor:
     """The same as `retrieve`, in plain tensor algebra, also for GPUs."""
-    half, batch, some = (size[0] // 2, size[1] // 2), len(pose), slice(_GRID // 2, None, _GRID)
-    both = [(part.expand(batch, *part.shape), mine[rows] if len(mine) else mine.expand(batch, *mine.shape))
-            for part, mine in ((shared.coarse, own.coarse), (shared.depth, own.depth), (shared.pose, own.pose))]  # fmt: skip
-    coarse, depth, poses = (torch.cat(pair, 1) for pair in both)
-    depths = cast_slowly(coarse.flatten(1, 2), pose, camera, half)[:, some, some].flatten(1)
-    beams = rays(camera, *half, pose.device)[some, some].flatten(0, 1)
-    points = (depths[..., None] * beams) @ rotation(pose).mT + pose[:, None, :3]
-    votes = vote_slowly(depth, poses, points, depths, camera)
-    numbers = torch.arange(len(shared), device=pose.device).expand(batch, -1)
-    numbers = torch.cat([numbers, torch.where(rows > 0, len(shared) + rows, -1)], 1)
-    picks = pick_slowly(votes * (numbers >= 0)[..., None], count)
+    batch, (height, width) = len(pose), (size[0] // 2, size[1] // 2)
+    off = _GRID // 2 + 0.5 - _GRID / 2  # of the points from the middle of their squares, pixels
+    grid = len(range(_GRID // 2, height, _GRID)), len(range(_GRID // 2, width, _GRID))
+    scale = grid[1] * _GRID / width, grid[0] * _GRID / height
+    middle = (camera[2] - off / width) / scale[0], (camera[3] - off / height) / scale[1]
+    thinned = camera[0] / scale[0], camera[1] / scale[1], *middle
+    coarse = torch.cat([shared.coarse.flatten(0, 1).expand(batch, -1, -1), own.coarse[rows].flatten(1, 2)], 1)
+    depths = cast(coarse, pose, thinned, grid, COARSE_CASTS)
+    points, depths = unproject(depths, pose, thinned).flatten(1, 2), depths.flatten(1)
+    known = constant(torch.arange, pose.device, len(shared)).expand(batch, -1)
+    votes = vote_slowly(((shared, known), (own, rows)), points, depths, camera)
+    votes = votes * F.pad(rows > 0, (len(shared), 0), value=True)[..., None]
+    numbers = torch.cat([known, (len(shared) + rows).masked_fill(rows <= 0, -1)], 1)
+    picks = pick_slowly(votes, count)
     if not numbers.shape[1]:
         return picks
-    lots = torch.where(picks >= 0, (picks - len(shared)).clamp_min(-1) // kernels.LOT, count + numbers.shape[1])
+    lots = ((picks - len(shared)).clamp_min(-1) // kernels.LOT).masked_fill(picks < 0, count + numbers.shape[1])
     picks = picks.gather(1, lots.argsort(dim=1, stable=True))
-    return torch.where(picks >= 0, numbers.gather(1, picks.clamp_min(0)), -1)
+    return numbers.gather(1, picks.clamp_min(0)).masked_fill(picks < 0, -1)
 
 
-def vote_slowly(depth, pose, points, distance, camera) -> torch.Tensor:
-    """Votes [B, K, P] of keyframes with depth [B, K, h, w] from pose [B, K, 7] for points [B, P, 3] at depth `distance` [B, P]."""
-    height, width = depth.shape[-2:]
-    where, ahead = project(points[:, None].expand(-1, depth.shape[1], -1, -1), pose, camera)
-    inside = (ahead > 0.05) & (where > 0).all(-1) & (where < 1).all(-1) & (distance < FAR_M)[:, None]
-    column = (where[..., 0] * width).clamp(0, width - 1).long()
-    row = (where[..., 1] * height).clamp(0, height - 1).long()
-    held = depth.flatten(2).gather(2, row * width + column)
-    same = inside & ((held - ahead).abs() < SAME * ahead)
-    ratio = distance[:, None] / ahead.clamp_min(0.05)
-    return torch.where(same, torch.minimum(ratio, 1 / ratio.clamp_min(1e-3)), 0.0)
+def vote_slowly(
+    keyframes: Sequence[tuple[Keyframes, torch.Tensor]], points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics
+) -> torch.Tensor:
+    """Votes [B, n, P] of keyframes, given by sets and rows [B, k] in them, for points [B, P, 3] that lie `distance` [B, P] deep in a
+    view."""
+    height, width = keyframes[0][0].depth.shape[-2:]
+    where, ahead = project(points[:, None], torch.cat([keys.pose[rows] for keys, rows in keyframes], 1), camera)
+    pixel = (where * constant(table, points.device, width, height)).clamp_min(0).nan_to_num(0.0)
+    pixel = torch.minimum(pixel, constant(table, points.device, width - 1, height - 1)).long()
+    pixel = pixel[..., 1] * width + pixel[..., 0]
+    parts = pixel.split([rows.shape[1] for _, rows in keyframes], 1)
+    held = [keys.depth.flatten()[rows[..., None] * (height * width) + part] for (keys, rows), part in zip(keyframes, parts)]
+    near = ahead.clamp_min(NEAR_M)
+    seen = ((where - 0.5).abs() < 0.5).all(-1) & (ahead > NEAR_M) & (distance < FAR_M)[:, None]
+    same = seen & ((torch.cat(held, 1) - ahead).abs() < SAME * ahead)
+    ratio = distance[:, None] / near
+    return torch.minimum(ratio, near / distance.clamp_min(1e-9)[:, None]) * same
 
 
 def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
     """Greedy choice by votes [B, K, P], each keyframe by what it adds to those before it: int64 [B, count], -1: no more."""
-    picks = torch.full((len(votes), count), -1, device=votes.device)
     if not votes.shape[1]:
-        return picks
+        return torch.full((len(votes), count), -1, device=votes.device)
     votes = torch.cat([votes, ANYWAY * votes.amax(2, keepdim=True)], 2)
-    best = torch.zeros_like(votes[:, 0])
-    for n in range(count):
-        gain, chosen = (votes - best[:, None]).clamp_min(0).sum(2).max(1)
-        picks[:, n] = torch.where(gain > 0, chosen, -1)
-        best = torch.maximum(best, votes.gather(1, chosen[:, None, None].expand(-1, 1, votes.shape[2]))[:, 0])
-    return picks
+    best, picks = torch.zeros_like(votes[:, :1]), []
+    for _ in range(count):
+        gain, chosen = (votes - best).relu().sum(2).max(1, keepdim=True)
+        picks.append(chosen.masked_fill(gain <= 0, -1))
+        best = torch.maximum(best, votes.take_along_dim(chosen[..., None], 1))
+    return torch.cat(picks, 1)
 
 
 # -- what they show ---------------------------------------------------------------------------------------------------
@@ -190,7 +200,7 @@ def look(
 ) -> Glimpse:  # fmt: skip
     """The views of `size` from `pose` [B, 7], from the picked keyframes [B, S] (see `retrieve`)."""
     own = Keyframes.none(size, pose.device) if own is None else own
-    if pose.device.type != "cpu":
+    if not kernels_do(pose):
         return look_slowly(shared, picks, pose, camera, size, slots, own)
     batch, (height, width) = len(pose), size
     depth = torch.full((batch, height, width), FAR_M)
@@ -230,7 +240,7 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
     if len(shared):
         patch = torch.where(mine[..., None, None], patch, shared.fine[torch.where(mine, 0, picks.clamp_min(0))])
     patch = patch * valid[..., None, None]
-    depth = cast_slowly(patch.flatten(1, 2), pose, camera, size)
+    depth = cast(patch.flatten(1, 2), pose, camera, size)
     hit = depth < FAR_M
     depth = fill_holes(depth)
     colours, trust = recall_slowly(rgb, key_depth, poses, valid, depth, pose, camera, slots)

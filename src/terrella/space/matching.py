@@ -3,6 +3,7 @@
 import torch
 import torch.nn.functional as F
 
+from ..core.backend import kernels_do
 from .kernels_numba.matching import edge_shares as edge_shares_kernel
 from .kernels_numba.matching import half_pixel_bounds as half_pixel_bounds_kernel
 from .kernels_numba.matching import majority_colours as majority_colours_kernel
@@ -35,7 +36,7 @@ def gather_sources(frames: torch.Tensor, source: torch.Tensor, moves: torch.Tens
 def half_pixel_bounds(frame: torch.Tensor) -> torch.Tensor:
     """The minimum and maximum colour of each pixel of uint8 [B, 3, H, W] when the picture is displaced by up to half a pixel:
     uint8 [B, 2, 3, H, W]. Pictures scroll by fractions of pixels, but sources are displaced by whole pixels."""
-    if frame.device.type != "cpu":
+    if not kernels_do(frame):
         return half_pixel_bounds_slowly(frame)
     bounds = torch.empty(len(frame), 2, *frame.shape[1:], dtype=torch.uint8)
     each_view(half_pixel_bounds_kernel, arrays(frame, bounds))
@@ -60,7 +61,7 @@ def source_shares(frames: torch.Tensor, truth: torch.Tensor, moves: torch.Tensor
     """How well each source (see `gather_sources`) explains each pixel of the next frames `truth` (uint8 [B, 3, H, W]): shares in
     0..1 [B, sources, H, W], from the 5 x 5 pixels around it, displaced with a tolerance of half a pixel; and the largest
     difference (of 255) from the unchanged pixel [B, H, W]."""
-    if frames.device.type != "cpu":
+    if not kernels_do(frames):
         return source_shares_slowly(frames, truth, moves)
     share = torch.empty(len(frames), len(moves) + frames.shape[1] - 1, *truth.shape[-2:])
     stays = torch.empty(len(frames), *truth.shape[-2:])
@@ -104,7 +105,7 @@ def majority_colours(
     """The colour of each pixel that most votes support, uint8 [B, 3, H, W]: mean shift's mode, but one of the given colours, those
     of sources (see `gather_sources`) with shares [B, sources + 1, H, W] and, last, of `painted` uint8 [B, 3, H, W]. Sources of one
     background outvote one of an object before it. The unchanged pixel counts `stress` times."""
-    if frames.device.type != "cpu":
+    if not kernels_do(frames):
         return majority_colours_slowly(frames, share, painted, moves, stress)
     drawn = torch.empty(painted.shape, dtype=torch.uint8)
     each_view(
@@ -139,7 +140,7 @@ def majority_colours_slowly(
 def edge_shares(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The share of the edges of `after` that each move brings from `before` (uint8 [B, 3, H, W]): 0..1 [B, M], from every second
     pixel with its neighbours above and to the left."""
-    if before.device.type != "cpu":
+    if not kernels_do(before):
         return edge_shares_slowly(before, after, moves)
     shares = torch.empty(len(after), len(moves))
     each_view(edge_shares_kernel, arrays(before, after, shares), *arrays(moves), SAME, TEXTURED)

@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 
 from ..core.arena import Arena
+from ..core.backend import kernels_do
 from ..core.errors import ContractError
 from ..core.state import State
 from .camera import Intrinsics, yaw
@@ -143,7 +144,7 @@ class Memory:
         apart, nearest = self.nearest(held, pose)
         which = which if kind == OBSERVED else which & (apart > 1)
         views = torch.arange(len(pose), device=pose.device)
-        if pose.device.type == "cpu":  # elsewhere it costs less to write all rows than to ask how many there are
+        if kernels_do(pose):  # elsewhere it costs less to write all rows than to ask how many there are
             views = which.nonzero()[:, 0]
             if not len(views):
                 return {}
@@ -169,9 +170,9 @@ class Memory:
         kind, born = held["memory_kind"][views], held["memory_born"][views]
         free, slot = (kind == EMPTY).max(1)
         full = wanted & ~free
-        if kind.device.type == "cpu" and not full.any():
+        if kernels_do(kind) and not full.any():
             return slot
-        some = full.nonzero()[:, 0] if kind.device.type == "cpu" else torch.arange(len(views), device=kind.device)
+        some = full.nonzero()[:, 0] if kernels_do(kind) else torch.arange(len(views), device=kind.device)
         covered = self.covered(held, views[some])
         best = covered > covered.amax(1, keepdim=True) - _ALIKE
         age = torch.where(kind[some] == DREAMT, born[some], born[some] + 2**62)
@@ -182,7 +183,7 @@ class Memory:
         """The share [n, capacity] of the view of each keyframe that others cover, in full memories `views` [n]: the mean over
         points of its surfaces of the best vote of another keyframe."""
         rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
-        if rows.device.type != "cpu":
+        if not kernels_do(rows):
             return self.covered_slowly(held, views)
         keys, share = self._keyframes(held), torch.zeros(rows.shape)
         given = arrays(keys.coarse, keys.depth, keys.turn, keys.pose, rows, dreamt)
@@ -196,7 +197,7 @@ class Memory:
         keys, count = self._keyframes(held), self.capacity
         points, pose = keys.coarse[rows][:, :, ::_EVERY, :3], keys.pose[rows]
         distance = ((points - pose[..., None, :3]) * keys.turn[rows][:, :, None, :, 0]).sum(-1)
-        votes = vote_slowly(keys.depth[rows], pose, points.flatten(1, 2), distance.flatten(1), self.camera)
+        votes = vote_slowly([(keys, rows)], points.flatten(1, 2), distance.flatten(1), self.camera)
         others = ~torch.eye(count, dtype=torch.bool, device=rows.device) & (dreamt[:, None, :] | ~dreamt[:, :, None])
         return (votes.unflatten(2, (count, -1)) * others[..., None]).amax(1).mean(2)
 

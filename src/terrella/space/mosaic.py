@@ -4,6 +4,7 @@ A pixel holds its most frequent colour (a majority vote, Boyer and Moore 1981), 
 import torch
 import torch.nn.functional as F
 
+from ..core.backend import kernels_do
 from .kernels_numba.matching import update_mosaic as update_mosaic_kernel
 from .views import arrays, each_view
 
@@ -19,7 +20,7 @@ def empty_mosaic(batch: int, size: tuple[int, int], device: torch.device | str =
 def update_mosaic(mosaic: torch.Tensor, frame: torch.Tensor, move: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
     """Mosaics uint8 [B, 4, H', W'] after the next pictures uint8 [B, 3, H, W], which scrolled by `move` int64 [B, 2] = x, y in
     pixels. The overlay, pixels `over` bool [H, W], does not scroll. What leaves the mosaic is forgotten."""
-    if frame.device.type != "cpu":
+    if not kernels_do(frame):
         return update_mosaic_slowly(mosaic, frame, move, over)
     after = torch.empty(mosaic.shape, dtype=torch.uint8)
     each_view(update_mosaic_kernel, arrays(mosaic, frame, move, after), *arrays(over), SAME, MOST)

@@ -4,6 +4,7 @@ Keyframes that see another surface at a pixel are masked there."""
 import torch
 import torch.nn.functional as F
 
+from ..core.backend import kernels_do
 from .camera import FAR_M, SAME, Intrinsics, project, rotation, unproject
 from .kernels_numba.carried import carry, fetch, splat
 from .kernels_numba.planes import fill
@@ -31,7 +32,7 @@ def least_around(plane: torch.Tensor) -> torch.Tensor:
 
 def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
     """Depth [B, H, W] with holes (FAR_M) filled by pull-push of 1/depth, after closing single-pixel gaps in near surfaces."""
-    if depth.device.type != "cpu" or depth.dtype != torch.float32 or depth.requires_grad:
+    if not kernels_do(depth) or depth.dtype != torch.float32 or depth.requires_grad:
         return fill_holes_slowly(depth, levels)
     filled = torch.empty_like(depth, memory_format=torch.contiguous_format)
     each_view(fill, arrays(depth, least_around(depth), filled), FAR_M, levels)
@@ -163,4 +164,4 @@ def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
 
 def _kernels_do(rgb: torch.Tensor, *others: torch.Tensor) -> bool:
     """Whether the compiled kernels can be used: on the CPU, uint8 colours, no gradients."""
-    return rgb.device.type == "cpu" and rgb.dtype == torch.uint8 and not any(part.requires_grad for part in others)
+    return kernels_do(rgb) and rgb.dtype == torch.uint8 and not any(part.requires_grad for part in others)

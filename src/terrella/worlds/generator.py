@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ..core.backend import kernels_do
 from ..space.keyframes import Glimpse, merge
 from .carried_frames import PLANES
 from .config import THUMBNAIL, GeneratorConfig
@@ -207,7 +208,7 @@ def decode(clean: torch.Tensor, posed: bool) -> DrawnFrame:
 
 def parts_of(noise: torch.Tensor) -> list[slice]:
     """The parts of a batch that are drawn one after another, where it is too large for one pass; else none."""
-    if noise.device.type != "cpu" or len(noise) <= AT_ONCE:
+    if not kernels_do(noise) or len(noise) <= AT_ONCE:
         return []
     return [slice(first, first + AT_ONCE) for first in range(0, len(noise), AT_ONCE)]
 

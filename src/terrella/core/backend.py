@@ -1,0 +1,44 @@
+"""Which of two ways computes: kernels of numba on a CPU, or programs of tensors, which run on every device and can be compiled."""
+
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from typing import Any
+
+import torch
+
+_tensors_alone = False
+
+
+def kernels_do(tensor: torch.Tensor) -> bool:
+    """Whether kernels of numba compute with the tensor: it lies on a CPU, and `tensor_programs` is not in force."""
+    return tensor.device.type == "cpu" and not _tensors_alone
+
+
+@contextmanager
+def tensor_programs() -> Iterator[None]:
+    """Inside, a CPU takes the way of other devices: for the compiler, and for tests of one way against the other."""
+    global _tensors_alone
+    before, _tensors_alone = _tensors_alone, True
+    try:
+        yield
+    finally:
+        _tensors_alone = before
+
+
+@lru_cache(maxsize=512, typed=True)
+def constant(make: Callable[..., torch.Tensor], device: torch.device, *given: Hashable) -> torch.Tensor:
+    """`make(*given)` on a device, made once: a constant that would be written by kernels, or copied to the device, at every step.
+    Nobody may write to it."""
+    with torch.inference_mode(False), torch.no_grad():
+        return make(*given).to(device)
+
+
+def table(*rows: Any) -> torch.Tensor:
+    """float32 numbers of nested tuples, for `constant`."""
+    return torch.tensor(rows, dtype=torch.float32)
+
+
+def where(mask: torch.Tensor, one: torch.Tensor, other: float) -> torch.Tensor:
+    """torch.where(mask, one, other) with a number that is not written to the device at every call."""
+    return torch.where(mask, one, constant(torch.tensor, one.device, other))

@@ -1,0 +1,80 @@
+"""What a step dispatches on a device, counted without one: kernels, waits and crossings, the same for any batch."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import terrella
+from terrella.core import make_rng
+from terrella.core.dispatch import Dispatches
+from terrella.worlds.config import HistoryConfig
+from terrella.worlds.controls import AXES, Controls
+from terrella.worlds.flow import FlowConfig, FlowNetwork
+from terrella.worlds.frame_history import FrameHistory, StartClips
+from terrella.worlds.latent import LatentWorld
+from terrella.worlds.latent_network import LatentConfig, LatentNetwork
+from terrella.worlds.learned import About, LearnedWorld
+
+
+def flow(moves: int) -> LearnedWorld:
+    """A world of frames alone, 64 x 64, whose pictures scroll by as many moves."""
+    size, slots, actions = (64, 64), 4, 4
+    network = FlowNetwork(FlowConfig(size, slots, 36 + slots * actions, moves))
+    network.moves[:, 0] = torch.arange(moves + 1)
+    settings = HistoryConfig(size, slots, actions, tuple(map(tuple, network.moves.tolist())) if moves else ())
+    starts = StartClips.of(torch.zeros(2, slots, 3, *size, dtype=torch.uint8), actions)
+    return LearnedWorld(
+        About("flow", Controls.buttons(actions), 0.1), scene=FrameHistory(settings, starts), generator=network
+    )
+
+
+def latent(pictures: bool) -> LatentWorld:
+    """A latent world of pictures, or an arm whose latent is its joints."""
+    controls = Controls(AXES, (-1.0,) * 2, (1.0,) * 2)
+    shape = {"size": (64, 64)} if pictures else {"vectors": (("joints", 4), ("speed", 4)), "identity": True, "latent": 8}
+    network = LatentNetwork(LatentConfig(2, **shape))
+    return LatentWorld(About("latent", controls, 0.1), network, torch.zeros(2, network.config.latent))
+
+
+WORLDS = {
+    "doom-maze": (lambda: terrella.load("doom-maze"), 1800),
+    "doom-corridor": (lambda: terrella.load("doom-corridor"), 2600),
+    "flow": (lambda: flow(0), 300),
+    "flow that scrolls": (lambda: flow(15), 300),
+    "latent": (lambda: latent(True), 80),
+    "arm": (lambda: latent(False), 60),
+}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name):
+    make, most = WORLDS[name]
+    world = make().to("meta")
+    shown = [channel for channel in ("rgb", "reward", "done") if channel in world.spec.channels]
+    counts = []
+    for batch in (1, 64):
+        rng = make_rng(0)
+        action = world.spec.sample_action(batch, rng)
+        state = world.start(batch, rng)
+        for _ in range(2):
+            state = world.imagine(state, action, rng)
+            world.render(state, shown)
+        with Dispatches("meta") as count:
+            state = world.imagine(state, action, rng)
+            world.render(state, shown)
+        print(f"{name}, batch {batch}: {count}")
+        counts.append(count)
+    assert all(count.kernels <= most for count in counts), counts[0].by_site.most_common(20)
+    assert abs(counts[0].kernels - counts[1].kernels) <= 6, "a batch of one may skip a copy"
+    assert all(count.waits == 0 and count.crossings <= 2 for count in counts), "the action and the seeds alone cross"
+
+
+def test_waits_crossings_and_masks_are_counted():
+    some = torch.arange(6.0)
+    with Dispatches("cpu") as count:
+        some[some > 2], some.nonzero(), float(some[0]), some[torch.tensor([1, 2])].view(2, 1)
+    assert count.waits == 3 and count.crossings == 0
+    with Dispatches("meta") as count:
+        some.to("meta") + 1
+    assert count.crossings == 1 and count.kernels == 2 and "2 kernels" in str(count)
