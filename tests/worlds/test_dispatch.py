@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 
 import terrella
 from terrella.core import make_rng
+from terrella.core.backend import tensor_programs
 from terrella.core.dispatch import Dispatches
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import AXES, Controls
@@ -32,7 +35,9 @@ def flow(moves: int) -> LearnedWorld:
 def latent(pictures: bool) -> LatentWorld:
     """A latent world of pictures, or an arm whose latent is its joints."""
     controls = Controls(AXES, (-1.0,) * 2, (1.0,) * 2)
-    shape = {"size": (64, 64)} if pictures else {"vectors": (("joints", 4), ("speed", 4)), "identity": True, "latent": 8}
+    shape = (
+        {"size": (64, 64)} if pictures else {"vectors": (("joints", 4), ("speed", 4)), "identity": True, "latent": 8}
+    )
     network = LatentNetwork(LatentConfig(2, **shape))
     return LatentWorld(About("latent", controls, 0.1), network, torch.zeros(2, network.config.latent))
 
@@ -40,8 +45,8 @@ def latent(pictures: bool) -> LatentWorld:
 WORLDS = {
     "doom-maze": (lambda: terrella.load("doom-maze"), 1800),
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 2600),
-    "flow": (lambda: flow(0), 300),
-    "flow that scrolls": (lambda: flow(15), 300),
+    "flow": (lambda: flow(0), 450),
+    "flow that scrolls": (lambda: flow(15), 1000),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }
@@ -68,6 +73,24 @@ def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name):
     assert all(count.kernels <= most for count in counts), counts[0].by_site.most_common(20)
     assert abs(counts[0].kernels - counts[1].kernels) <= 6, "a batch of one may skip a copy"
     assert all(count.waits == 0 and count.crossings <= 2 for count in counts), "the action and the seeds alone cross"
+
+
+@pytest.mark.parametrize("name", ["doom-maze", pytest.param("doom-corridor", marks=pytest.mark.slow)])
+def test_a_device_draws_what_the_kernels_draw(name):
+    world, shown = terrella.load(name), []
+    for way in (nullcontext, tensor_programs):
+        with way():
+            rng = make_rng(4)
+            state = world.start(2, rng)
+            for step in range(3):
+                state = world.imagine(state, world.spec.sample_action(2, make_rng(step)), rng)
+            shown.append(world.render(state, ["rgb", "depth", "pose", "uncertainty"]))
+    kernels, programs = shown
+    torch.testing.assert_close(programs["pose"], kernels["pose"], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(programs["uncertainty"], kernels["uncertainty"], atol=1e-4, rtol=1e-2)
+    off = (programs["rgb"].int() - kernels["rgb"].int()).abs().amax(-1)
+    assert float((off > 2).float().mean()) < 2e-3, "a pixel on the edge of a surface may fall to its other side"
+    assert float(torch.isclose(programs["depth"], kernels["depth"], rtol=1e-2).float().mean()) > 0.998
 
 
 def test_waits_crossings_and_masks_are_counted():

@@ -39,7 +39,9 @@ class Dispatches(TorchDispatchMode):
             self.kernels += 1
             self.by_name[name] += 1
             self.by_site[_call_site()] += 1
-            masks = name.startswith("aten::index") and any(part.dtype in (torch.bool, torch.uint8) for part in given[1:])
+            masks = name.startswith("aten::index") and any(
+                part.dtype in (torch.bool, torch.uint8) for part in given[1:]
+            )
             self.waits += name in WAITS or (masks and name != "aten::index_put_" and _selects(args))
             self.crossings += name in ("aten::_to_copy", "aten::copy_") and not all(here)
         return result

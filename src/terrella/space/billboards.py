@@ -116,7 +116,9 @@ def paint_billboards_slowly(
     (batch, height, width), count = depth.shape, billboards[0].shape[1]
     order, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
     pictures = billboards[1].flatten(0, 1)
-    quarters = torch.arange(2 * max(height, width), device=rgb.device) / 2 + 0.25  # two samples along each side of a pixel
+    quarters = (
+        torch.arange(2 * max(height, width), device=rgb.device) / 2 + 0.25
+    )  # two samples along each side of a pixel
     left, right, top, bottom = sides.clamp(-1e6, 1e6)[..., None].unbind(2)
     across = (quarters[: 2 * width] - left) / (right - left).clamp_min(1e-6) * 2 - 1
     down = (quarters[: 2 * height] - top) / (bottom - top).clamp_min(1e-6) * 2 - 1

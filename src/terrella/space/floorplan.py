@@ -215,8 +215,8 @@ def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor,
 
 
 class _Sides(NamedTuple):
-    """Walls [B, S] by their separating axes x, y and across: the axes [B, S, 3, 2], how far along each lie the ends of a wall that is
-    a body's half width larger, low and high [B, S, 3]; the sines [B, S, 3, 3] of the angles between axes; real [B, S]."""
+    """Walls [B, S] by their separating axes x, y and across: the axes [B, S, 3, 2]; how far along each lie the ends of a wall that
+    is a body's half width larger, low and high [B, S, 3]; the sines [B, S, 3, 3] of the angles between axes; real [B, S]."""
 
     unit: torch.Tensor
     low: torch.Tensor

@@ -160,17 +160,22 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
 
 
 def vote_slowly(
-    keyframes: Sequence[tuple[Keyframes, torch.Tensor]], points: torch.Tensor, distance: torch.Tensor, camera: Intrinsics
+    keyframes: Sequence[tuple[Keyframes, torch.Tensor]],
+    points: torch.Tensor,
+    distance: torch.Tensor,
+    camera: Intrinsics,
 ) -> torch.Tensor:
-    """Votes [B, n, P] of keyframes, given by sets and rows [B, k] in them, for points [B, P, 3] that lie `distance` [B, P] deep in a
-    view."""
+    """Votes [B, n, P] of keyframes, given by sets and rows [B, k] in them, for points [B, P, 3] that lie `distance` [B, P] deep in
+    a view."""
     height, width = keyframes[0][0].depth.shape[-2:]
     where, ahead = project(points[:, None], torch.cat([keys.pose[rows] for keys, rows in keyframes], 1), camera)
     pixel = (where * constant(table, points.device, width, height)).clamp_min(0).nan_to_num(0.0)
     pixel = torch.minimum(pixel, constant(table, points.device, width - 1, height - 1)).long()
     pixel = pixel[..., 1] * width + pixel[..., 0]
     parts = pixel.split([rows.shape[1] for _, rows in keyframes], 1)
-    held = [keys.depth.flatten()[rows[..., None] * (height * width) + part] for (keys, rows), part in zip(keyframes, parts)]
+    held = [
+        keys.depth.flatten()[rows[..., None] * (height * width) + part] for (keys, rows), part in zip(keyframes, parts)
+    ]
     near = ahead.clamp_min(NEAR_M)
     seen = ((where - 0.5).abs() < 0.5).all(-1) & (ahead > NEAR_M) & (distance < FAR_M)[:, None]
     same = seen & ((torch.cat(held, 1) - ahead).abs() < SAME * ahead)
@@ -253,7 +258,8 @@ def recall_slowly(rgb, depth, poses, valid, seen, pose, camera, slots) -> tuple[
     colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera)
     likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
     sure = torch.where(valid[..., None, None], agreement * likeness**2, -1.0)
-    best, order = sure.topk(min(slots, sure.shape[1]), dim=1)
+    # of equals the first, as the kernel does
+    best, order = (part[:, :slots] for part in sure.sort(dim=1, descending=True, stable=True))
     shown = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]
     missing = slots - best.shape[1]
     colours = torch.cat([shown, shown.new_zeros(len(shown), missing, *shown.shape[2:])], 1)
