@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from types import SimpleNamespace
 
@@ -514,3 +515,17 @@ def test_documented_names_are_for_gymnasiums_own_environments_alone():
         assert GymnasiumWorld("CartPole-v77", GymnasiumConfig(rgb=False)).spec.action_names == ()
     finally:
         del gymnasium.registry["CartPole-v77"]
+
+
+def test_ids_of_minigrid_need_no_module(tmp_path, monkeypatch):
+    with pytest.raises(TerrellaError, match="needs the package 'minigrid', which is not installed: pip install it"):
+        monkeypatch.setitem(sys.modules, "minigrid", None)
+        GymnasiumWorld("BabyAI-Nowhere-v0")
+    monkeypatch.delitem(sys.modules, "minigrid")
+    (tmp_path / "minigrid.py").write_text(
+        "import gymnasium\ngymnasium.register('BabyAI-Nowhere-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert GymnasiumWorld("BabyAI-Nowhere-v0", rgb=False).spec.name == "gym:BabyAI-Nowhere-v0"
+    gymnasium.registry.pop("BabyAI-Nowhere-v0")
+    del sys.modules["minigrid"]

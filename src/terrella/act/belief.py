@@ -10,8 +10,10 @@ from ..core.policy import Policy
 from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
+from . import imitation
 from .actor import Actor, policy_folder, read_policy
 from .goal_network import KIND, GoalActor
+from .imitation import ImitationActor
 from .planning import Cost, GoalBeliefPolicy
 
 
@@ -36,7 +38,10 @@ class BeliefPolicy:
 def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
     """The learned policy of a folder, for the actions of `spec`. One that sees channels which only `world` has acts through the
     world; a goal-conditioned one acts towards the goal of `cost`. ActionError, ChannelError or PlanningError if it does not fit."""
-    if read_policy(policy_folder(folder)).get("kind") == KIND:
+    kind = read_policy(policy_folder(folder)).get("kind")
+    if kind == imitation.KIND:
+        return ImitationActor.load(folder, spec)
+    if kind == KIND:
         if world is None or cost is None:
             raise PlanningError(
                 f"{folder} is a goal-conditioned policy: it needs the world that it was learned in, and a goal."

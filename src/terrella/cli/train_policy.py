@@ -9,15 +9,14 @@ from ..workflows.train_policy import TrainPolicyConfig, train_policy
 from .say import Json, say, show
 
 
-def policy(world: Annotated[str, arg(name="in")], config: TrainPolicyConfig, json: Json = False) -> None:
-    """Train a policy on imagined rollouts of a world, hundreds at once, and measure its return in the real environment.
-    Stop it with Ctrl-C at any time; the same command continues.
+def policy(config: TrainPolicyConfig, world: Annotated[str | None, arg(name="in")] = None, json: Json = False) -> None:
+    """Train a policy on imagined rollouts of a world, hundreds at once, or with --method imitation on the actions of a recording,
+    and measure its return in the real environment. Stop it with Ctrl-C at any time; the same command continues.
 
     Args:
         world: The world to practise in: a name of `terrella list`, the path of a checkpoint or run, or a simulator (gym:ID).
+            Not for imitation.
     """
-    show(
-        trained := train_policy(world, config, progress=say),
-        json,
-        command("terrella", "play", world, agent=trained.folder),
-    )
+    trained = train_policy(world, config, progress=say)
+    played = world or config.real
+    show(trained, json, command("terrella", "play", played, agent=trained.folder) if played else "")

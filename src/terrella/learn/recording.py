@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from ..core.errors import DatasetError
 from ..core.spec import Spec
 from ..data import ClipCache, Dataset, split
-from ..data.training.cache import episodes_with
+from ..data.training.cache import episodes_with, further_cameras
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
@@ -50,14 +50,17 @@ class Recording:
         keep_out: Box | None = None,
         needs: tuple[str, ...] = ("rgb",),
         why: str = "a world of pictures is learned from them",
+        cameras: Sequence[str] = (),
     ) -> Recording:
         """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitted_size`). A clip
         cache of it is kept on this machine, for rows are read in random order. Every 20th episode is held out, and so are the
-        rows in which something in the box `keep_out` is visible; episodes without a channel of `needs` are left out. DatasetError
-        if it lacks a channel of `needs`, or rows."""
+        rows in which something in the box `keep_out` is visible; episodes without a channel of `needs` are left out. cameras:
+        further pictures to keep, at the same size. DatasetError if it lacks a channel of `needs`, or rows."""
         dataset = data if isinstance(data, Dataset) else Dataset(data)
         size = size or fitted_size(dataset)
-        cache = ClipCache.open(dataset, size, lambda done, total: report(done, total, "building the clip cache"))
+        further = further_cameras(dataset, cameras)
+        shown = lambda done, total: report(done, total, "building the clip cache")  # noqa: E731
+        cache = ClipCache.open(dataset, size, shown, further)
         lacks = [name for name in needs if not has_channel(cache, name)]
         if lacks:
             raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
@@ -117,6 +120,13 @@ class Recording:
     def posed(self) -> bool:
         """Whether it has depth, poses and a camera."""
         return all(has_channel(self.cache, name) for name in ("depth", "pose", "camera"))
+
+    def episode_returns(self) -> np.ndarray | None:
+        """float64 [E], the sum of each episode's rewards; None without rewards."""
+        if self.cache.reward is None:
+            return None
+        total = np.append(0.0, np.cumsum(np.asarray(self.cache.reward, np.float64).reshape(-1)))
+        return total[self.cache.ranges[:, 1]] - total[self.cache.ranges[:, 0]]
 
     def rows_within(self, before: int, after: int, acted: bool = False) -> np.ndarray:
         """Rows with `before` usable rows before them and `after` after them in their episode, all with valid actions if `acted`."""

@@ -1,5 +1,6 @@
 """Makes Gymnasium environments, and explains in one sentence why one cannot be made, reset or rendered."""
 
+import importlib
 import os
 import re
 import runpy
@@ -17,6 +18,7 @@ from .drawn_pictures import DrawnPictures
 
 _DISPLAY = re.compile(r"display|video device|gl context|\b(glfw|opengl|egl|osmesa|x11|glx|xlib)\b")
 
+_PACKAGES = {"BabyAI-": "minigrid", "MiniGrid-": "minigrid"}  # beginnings of ids, and the modules that register them
 _EXTRA = re.compile(r"gymnasium\[(box2d|mujoco)\]")  # extras of Gymnasium that are also ours
 
 
@@ -30,8 +32,11 @@ def build(env: str | Callable[[], gymnasium.Env], rgb: bool, options: dict) -> t
         sys.path.insert(0, os.getcwd())  # as `python -m` does
     options = {"max_episode_steps": -1, "disable_env_checker": True, **options}
     module = env.partition(":")[0] if ":" in env else ""
+    package = next((one for begins, one in _PACKAGES.items() if env.startswith(begins)), "")
     with explained(f"gym:{env}", "made", module):
         try:
+            if package:
+                importlib.import_module(package)
             built = gymnasium.make(env, **options)
             if rgb and "rgb_array" in _render_modes(built):
                 built.close()

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 
 from .. import library
+from ..act.actor import policy_folder, read_policy
 from ..act.explorer import Explorer
+from ..act.imitation import KIND, ImitationActor
 from ..act.planning import (
     STRIDE_S,
     Destination,
@@ -22,14 +24,17 @@ from ..act.planning import (
     search_config_within,
 )
 from ..act.policies_by_name import NoisyPolicy
+from ..act.sentences import words_of
 from ..core.errors import PlanningError
+from ..core.instruction import bytes_to_text, text_to_bytes
 from ..core.policy import observed_channels
-from ..core.spec import Spec
+from ..core.spec import TEXT, Spec, shape_of
 from ..core.state import State
 from ..core.world import Observation, World, make_rng
 from ..serve.agent import Agent, Agents, Futures
 from .goals import state_channel, with_estimated_pose
 
+TEXT_CHANNEL = "text"
 _REPLAN_S = 0.06  # world time for which a plan is executed before the next is made
 _NEAR = 0.05  # share of a range within which a goal is reached
 _SHOWN = ("pose", "places")  # channels by which routes are planned, beside those that a planner's world observes
@@ -50,10 +55,13 @@ class PageAgents:
             self.make({})
         spec = self.played.spec
         places = self.world is not None and "pose" in spec.channels and "pose" in self.world.spec.channels
-        return Agents(self.make, places, pictures=self.world is not None and "rgb" in spec.channels)
+        pictures = self.world is not None and "rgb" in spec.channels
+        return Agents(self.make, places, pictures, self._instruction if self._follows_instructions else None)
 
     def make(self, goal: Observation) -> Agent:
         """The agent to a goal or, for {}, the one of the name."""
+        if TEXT_CHANNEL in goal:
+            return self._instructed(goal[TEXT_CHANNEL])
         if goal:
             return self._seeking(goal)
         if self.name == "":
@@ -63,12 +71,53 @@ class PageAgents:
             if agent is None:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
             return agent
-        policy = library.load_policy(self.name, self.played.spec, self.world)
+        policy = library.load_policy(self.name, self._spec, self.world)
         plans = policy.policy if isinstance(policy, NoisyPolicy) else policy
         if isinstance(plans, Planner):
             return Agent(self.name, policy, self.see, futures=self._futures(plans) if plans is policy else None)
+        if isinstance(policy, ImitationActor) and TEXT_CHANNEL in policy.sees:
+            return Agent(self.name, policy, self._see_with(policy))
         sees = observed_channels(policy, self.played.spec)
         return Agent(self.name, policy, lambda state: self.played.render(state, sees))
+
+    # -- instructions -------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _spec(self) -> Spec:
+        """The spec for the policy: where the world gives no instructions to one that imitates, the person may."""
+        spec, folder = self.played.spec, policy_folder(self.name)
+        if not folder.is_dir() or read_policy(folder).get("kind") != KIND:
+            return spec
+        return replace(spec, channels={**spec.channels, TEXT_CHANNEL: TEXT})
+
+    @cached_property
+    def _follows_instructions(self) -> bool:
+        policy = self.make({}).policy if self.name not in ("", "plan") else None
+        return isinstance(policy, ImitationActor) and TEXT_CHANNEL in policy.sees
+
+    def _instruction(self, words: str) -> Observation:
+        """The instruction as a goal. PlanningError if the policy knows none of its words."""
+        policy = library.load_policy(self.name, self._spec, self.world)
+        assert isinstance(policy, ImitationActor)
+        if len(policy.unknown(words)) == len(set(words_of(words))):
+            known = ", ".join(policy.network.config.vocabulary)
+            raise PlanningError(f"the policy knows none of the words of '{words}'; it knows {known}.")
+        return {TEXT_CHANNEL: torch.from_numpy(text_to_bytes(words).copy())[None]}
+
+    def _instructed(self, text: torch.Tensor) -> Agent:
+        """The policy with this instruction [1, TEXT_BYTES] in place of the world's own. The agent's name tells what it ignores."""
+        policy = library.load_policy(self.name, self._spec, self.world)
+        assert isinstance(policy, ImitationActor)
+        unknown = ", ".join(f"'{word}'" for word in policy.unknown(bytes_to_text(text[0].numpy())))
+        name = f"{self.name} (does not know {unknown})" if unknown else self.name
+        return Agent(name, policy, self._see_with(policy, text))
+
+    def _see_with(self, policy: ImitationActor, text: torch.Tensor | None = None) -> Callable[[State], Observation]:
+        """What the policy sees: of the world, with this instruction, or with an empty one where the world has none."""
+        given = text is not None or TEXT_CHANNEL not in self.played.spec.channels
+        text = torch.zeros(1, *shape_of(TEXT), dtype=torch.uint8) if text is None else text
+        sees = [name for name in policy.sees if not (given and name == TEXT_CHANNEL)]
+        return lambda state: {**self.played.render(state, sees), **({TEXT_CHANNEL: text} if given else {})}
 
     # -- where it plans -----------------------------------------------------------------------------------------------
 

@@ -43,9 +43,9 @@ class Practice:
     minutes: float | None = None
     steps: int | None = None  # Training steps, each on one batch of rollouts.
     # "ppo" takes several epochs over each batch (objectives/ppo.py), "actor-critic" one gradient step, as in DreamerV3
-    # (objectives/actor_critic.py). Default: ppo in a simulator that steps many episodes together, as mujoco: does, else
-    # actor-critic.
-    method: Literal["actor-critic", "ppo"] | None = None
+    # (objectives/actor_critic.py), "imitation" learns from the actions of a recording alone. Default: ppo in a simulator that
+    # steps many episodes together, as mujoco: does, else actor-critic.
+    method: Literal["actor-critic", "ppo", "imitation"] | None = None
     # Episodes in parallel. Default: 256.
     batch: int | None = None
     # Horizon: steps of a rollout. Default: 16, for ppo 24.

@@ -1,0 +1,109 @@
+"""ImitationActor: a policy learned from demonstrations, with a history, chunks of actions and an instruction."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, final
+
+import torch
+
+from ..core import chance
+from ..core.errors import ChannelError
+from ..core.instruction import bytes_to_text
+from ..core.spec import Spec
+from ..core.state import State
+from ..core.world import Observation
+from .actor import load_network, write_policy
+from .actor_network import ActorConfig
+from .imitation_network import TEXT, ImitationConfig, ImitationNetwork
+
+KIND, VERSION = "imitation", 1
+_STREAM = 12
+
+
+@final
+class ImitationActor:
+    """A Policy for the actions of `spec`; ActionError or ChannelError if the network is for others.
+
+    Its memory holds the features of the last observations and what is left of the chunk. Words of an instruction that it does not
+    know are left out, with a warning that names them.
+    """
+
+    def __init__(self, network: ImitationNetwork, spec: Spec, card: Mapping[str, Any] | None = None):
+        network.config.check(spec)
+        self.network, self.spec, self.card = network, spec, dict(card or {})
+        self._warned: set[str] = set()
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        """The channels to show it."""
+        return self.network.config.sees
+
+    def begin(self, batch: int, rng: torch.Generator) -> State:
+        config, width = self.network.config, self.network.config.action_width
+        return State(
+            {
+                "features": torch.zeros(batch, config.history, self.network.width),
+                "acted": torch.zeros(batch, config.history, width),
+                "chunk": torch.zeros(batch, config.chunk, width),
+                "taken": torch.full((batch,), -1),  # actions of the chunk that were taken; -1 at the start
+            }
+        )
+
+    @torch.no_grad()
+    def act(self, observation: Observation, memory: State, rng: torch.Generator) -> tuple[torch.Tensor, State]:
+        """The actions [B, *action.shape], on the CPU."""
+        network, config, batch = self.network, self.network.config, memory.batch
+        if missing := [name for name in self.sees if name not in observation]:
+            raise ChannelError(f"the policy sees {', '.join(missing)}, which the observation lacks.")
+        words = self._words(observation[TEXT]) if network.words is not None else None
+        features = network.features(observation, words).cpu()[:, None]
+        first = (memory["taken"] < 0)[:, None, None]
+        history = torch.where(first, features, torch.cat([memory["features"][:, 1:], features], 1))
+        seeds = chance.seeds(batch, rng, torch.device("cpu"))
+        noise = chance.normal(seeds, (config.chunk * config.action_width,), _STREAM)
+        chunk, taken = memory["chunk"], memory["taken"]
+        anew = (taken < 0) | (taken >= config.execute)
+        if anew.any():
+            device, wanted = network.mean.device, config.outcome
+            outcome = None if wanted is None else torch.full((batch,), wanted, device=device)
+            out = network(history.to(device), memory["acted"].to(device), words, outcome)
+            predicted = network.chunk(out, noise.to(device)).cpu()
+            chunk, taken = torch.where(anew[:, None, None], predicted, chunk), torch.where(anew, 0, taken)
+        encoded = chunk[torch.arange(batch), taken]
+        acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
+        kept = {"features": history, "acted": acted, "chunk": chunk, "taken": taken + 1}
+        return config.decode(encoded, self.spec), State(kept)
+
+    def unknown(self, text: str) -> tuple[str, ...]:
+        """The words of an instruction that it does not know."""
+        return self.network.words.unknown(text) if self.network.words is not None else ()
+
+    def _words(self, padded: torch.Tensor) -> torch.Tensor:
+        assert self.network.words is not None
+        texts = [bytes_to_text(row.numpy()) for row in padded.cpu()]
+        if new := [text for text in dict.fromkeys(texts) if text not in self._warned and self.unknown(text)]:
+            self._warned.update(new)
+            names = ", ".join(dict.fromkeys(f"'{word}'" for text in new for word in self.unknown(text)))
+            warnings.warn(f"the policy does not know {names} and leaves that out of the instruction.", stacklevel=3)
+        return self.network.words(self.network.words.read(texts).to(self.network.mean.device))
+
+    @staticmethod
+    def write(network: ImitationNetwork, folder: str | Path, card: Mapping[str, Any]) -> None:
+        """Writes the folder of a policy, each file atomically; CheckpointError if it cannot be written."""
+        description = {"kind": KIND, "version": VERSION, "config": asdict(network.config), "card": dict(card)}
+        write_policy(folder, description, network)
+
+    @staticmethod
+    def load(folder: str | Path, spec: Spec) -> ImitationActor:
+        """Loads a saved policy, from its folder or that of the training run. CheckpointError if it is missing or foreign,
+        ActionError or ChannelError if `spec` has other actions or lacks a channel."""
+
+        def make(config: dict[str, Any]) -> ImitationNetwork:
+            return ImitationNetwork(ImitationConfig(**{**config, "actor": ActorConfig(**config["actor"])}))
+
+        network, card = load_network(folder, KIND, VERSION, make)
+        return ImitationActor(network, spec, card)

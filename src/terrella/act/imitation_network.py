@@ -1,0 +1,195 @@
+"""The network of an imitating policy: pictures, numbers and an instruction over some steps, to a chunk of actions (ACT, Zhao et al.
+2023): logits for choices and buttons, flow matching for axes (Lipman et al. 2023; pi0, Black et al. 2024)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from ..core.errors import ChannelError
+from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
+from .actor_network import AXES, MAX_SYMLOG, ActorConfig, mlp, symlog
+from .sentences import WordEncoder
+
+TEXT = "text"
+LEAST_PICTURE_SIDE = 16  # pixels: smaller arrays [H, W, C] are codes of cells, as those of MiniGrid
+CODES = 32  # values of a code
+CELLS = 4  # side of the pooled feature map of a picture
+FLOW_STEPS = 8  # Euler steps from noise to a chunk
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    """The inputs, the actions and the size of an imitating policy."""
+
+    actor: ActorConfig  # channels, actions and width
+    size: tuple[int, int] = (64, 64)  # height and width to which pictures are resized
+    vocabulary: tuple[str, ...] = ()  # words of the instructions; () for a policy without
+    history: int = 2  # observations that it sees, the last ones
+    own_actions: bool = False  # whether it sees its last actions as well
+    chunk: int = 1  # actions that it predicts at once
+    execute: int = 1  # of these, actions that it takes before it predicts anew
+    outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
+
+    @property
+    def sees(self) -> tuple[str, ...]:
+        return (*(name for name, _ in self.actor.sees), *((TEXT,) if self.vocabulary else ()))
+
+    @property
+    def action_width(self) -> int:
+        """Numbers of an action as networks see it."""
+        return sum(self.actor.counts) if self.actor.mode == CHOICE else len(self.actor.low)
+
+    def check(self, spec: Spec) -> None:
+        """ActionError or ChannelError if `spec` has other actions, or lacks a channel in this form. Pictures may have any size."""
+        replace(self.actor, sees=()).check(spec)
+        for name, shape in self.actor.sees:
+            spec.check_channels((name,))
+            other = shape_of(spec.channels[name])
+            if not is_picture(shape) and np.prod(other) != np.prod(shape):
+                raise ChannelError(f"the policy sees '{name}' of shape {shape}, and {spec.name} shows {other}.")
+        if self.vocabulary and TEXT not in spec.channels:
+            raise ChannelError(f"the policy follows instructions, and {spec.name} gives none (no channel '{TEXT}').")
+
+    def encode(self, action: torch.Tensor) -> torch.Tensor:
+        """Actions [N, *shape] as float32 [N, action_width]: choices one-hot, buttons as they are, axes scaled to -1..1."""
+        flat = action.reshape(len(action), -1).float()
+        low, high = (torch.tensor(limit, device=flat.device) for limit in (self.actor.low, self.actor.high))
+        if self.actor.mode == CHOICE:
+            whole = (flat - low).round().long()
+            parts = [F.one_hot(whole[:, n].clamp(0, count - 1), count) for n, count in enumerate(self.actor.counts)]
+            return torch.cat(parts, 1).float()
+        return (
+            flat if self.actor.mode == BUTTONS else (2 * (flat - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
+        )
+
+    def decode(self, encoded: torch.Tensor, spec: Spec) -> torch.Tensor:
+        """The inverse of `encode`, in the space of `spec`: [N, *action.shape]."""
+        if self.actor.mode == AXES:
+            return self.actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
+        if self.actor.mode == BUTTONS:
+            return self.actor.actions(encoded, spec)
+        parts = encoded.split(list(self.actor.counts), 1)
+        return self.actor.actions(torch.stack([part.argmax(1) for part in parts], 1).float(), spec)
+
+
+def is_picture(shape: tuple[int, ...]) -> bool:
+    return len(shape) == 3 and min(shape[:2]) >= LEAST_PICTURE_SIDE
+
+
+class _Look(nn.Module):
+    """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018)."""
+
+    offset: torch.Tensor
+
+    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: int):
+        super().__init__()
+        self.picture, self.size = is_picture(shape), size
+        channels = shape[2]
+        if self.picture:
+            widths = (channels, 16, 32, 48)
+            self.first = nn.Sequential(
+                *[part for a, b in zip(widths, widths[1:]) for part in (nn.Conv2d(a, b, 4, 2, 1), nn.ReLU())]
+            )
+            last, cells = 48, CELLS**2
+        else:
+            self.codes = nn.Embedding(channels * CODES, 32)
+            self.register_buffer("offset", torch.arange(channels) * CODES, persistent=False)
+            self.first = nn.Sequential(nn.Conv2d(32, 32, 3, 1, 1), nn.ReLU())
+            last, cells = 32, shape[0] * shape[1]
+        self.film = nn.Linear(words, 2 * last) if words else None
+        self.second = nn.Sequential(nn.Conv2d(last, last, 3, 1, 1), nn.ReLU())
+        self.out = nn.Linear(last * cells, width)
+
+    def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
+        if self.picture:
+            unit = seen.permute(0, 3, 1, 2).float() / (255 if seen.dtype == torch.uint8 else 1) - 0.5
+            features = self.first(unit if unit.shape[2:] == self.size else F.interpolate(unit, self.size, mode="area"))
+        else:
+            codes = seen.long().clamp(0, CODES - 1) + self.offset
+            features = self.first(self.codes(codes).sum(3).permute(0, 3, 1, 2))
+        if self.film is not None and words is not None:
+            scale, shift = self.film(words)[..., None, None].chunk(2, 1)
+            features = torch.relu((1 + scale) * features + shift)
+        features = self.second(features)
+        features = F.adaptive_avg_pool2d(features, CELLS) if self.picture else features
+        return torch.relu(self.out(features.flatten(1)))
+
+
+class ImitationNetwork(nn.Module):
+    """`features` of each step's observation, and from those of the last steps the chunk of actions."""
+
+    mean: torch.Tensor
+    scale: torch.Tensor
+
+    def __init__(self, config: ImitationConfig):
+        super().__init__()
+        self.config, actor = config, config.actor
+        self.words = WordEncoder(config.vocabulary) if config.vocabulary else None
+        words = self.words.width if self.words else 0
+        self._vectors = [(name, int(np.prod(shape))) for name, shape in actor.sees if len(shape) < 2]
+        self._arrays = [(name, shape) for name, shape in actor.sees if len(shape) == 3]
+        width = sum(count for _, count in self._vectors)
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("scale", torch.ones(width))
+        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
+        self.width = width + actor.hidden * len(self.looks)
+        acted = config.history * config.action_width if config.own_actions else 0
+        into = config.history * self.width + acted + words + (config.outcome is not None)
+        flow = actor.mode == AXES
+        chunk = config.chunk * (config.action_width if flow else actor.outputs)
+        self.trunk = mlp(into, actor.hidden, actor.layers, actor.hidden if flow else chunk, gain=1.0 if flow else 0.1)
+        self.velocity = mlp(actor.hidden + chunk + 1, 2 * actor.hidden, 2, chunk, gain=0.1) if flow else None
+
+    def features(self, seen: Mapping[str, torch.Tensor], words: torch.Tensor | None) -> torch.Tensor:
+        """[N, width] of observations of N steps; words: the instruction as features [N, words]."""
+        device, parts = self.mean.device, []
+        if self._vectors:
+            flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
+            parts.append(symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG))
+        parts += [look(seen[name].to(device), words) for look, (name, _) in zip(self.looks, self._arrays)]
+        return torch.cat(parts, 1)
+
+    def fit_normalization(self, seen: Mapping[str, torch.Tensor]) -> None:
+        """Takes mean and deviation from observations; numbers that never vary keep a deviation of 1."""
+        if self._vectors:
+            flat = torch.cat([seen[name].double().reshape(-1, count) for name, count in self._vectors], 1)
+            spread = flat.std(0, correction=0)
+            self.mean.copy_(flat.mean(0))
+            self.scale.copy_(torch.where(spread <= 1e-6, 1.0, spread))
+
+    def forward(
+        self, history: torch.Tensor, acted: torch.Tensor, words: torch.Tensor | None, outcome: torch.Tensor | None
+    ) -> torch.Tensor:
+        """From features [N, history, width], own actions [N, history, A], the instruction's features and the return that is asked
+        for [N]: logits [N, chunk * outputs], or for axes the condition [N, hidden] of the flow."""
+        parts = [history.flatten(1)]
+        parts += [acted.flatten(1)] if self.config.own_actions else []
+        parts += [words] if words is not None else []
+        parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []
+        return self.trunk(torch.cat(parts, 1))
+
+    def flow(self, noisy: torch.Tensor, time: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
+        """The velocity [N, chunk * A] of chunks at flow times [N], 0 noise and 1 data."""
+        assert self.velocity is not None
+        return self.velocity(torch.cat([condition, noisy, time[:, None]], 1))
+
+    def chunk(self, out: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        """The most likely chunk [N, chunk, A] of encoded actions from `forward`; of axes the one to which noise [N, chunk * A]
+        flows."""
+        config, count = self.config, len(out)
+        if config.actor.mode == AXES:
+            for step in range(FLOW_STEPS):
+                time = torch.full((count,), step / FLOW_STEPS, device=out.device)
+                noise = noise + self.flow(noise, time, out) / FLOW_STEPS
+            return noise.view(count, config.chunk, -1).clamp(-1, 1)
+        logits = out.view(count * config.chunk, -1)
+        if config.actor.mode == BUTTONS:
+            return (logits > 0).float().view(count, config.chunk, -1)
+        parts = [F.one_hot(part.argmax(1), part.shape[1]) for part in logits.split(list(config.actor.counts), 1)]
+        return torch.cat(parts, 1).float().view(count, config.chunk, -1)

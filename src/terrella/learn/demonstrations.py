@@ -1,0 +1,84 @@
+"""DemonstrationRows: moments of a recording for imitation, with the observations before them and the actions from them on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..act.imitation_network import ImitationConfig
+from ..act.sentences import WordEncoder
+from ..core.errors import DatasetError
+from ..data.training.cache import array_for
+from .objectives.imitation import Demonstrations
+from .recording import Recording
+
+
+@dataclass(frozen=True)
+class DemonstrationRows:
+    """The rows of a recording whose actions are imitated."""
+
+    recording: Recording
+    config: ImitationConfig
+    device: torch.device
+    rows: np.ndarray  # that are sampled
+    stop: np.ndarray  # [R]: the end of each row's episode
+    actions: torch.Tensor  # float32 [R, A], encoded
+    words: torch.Tensor | None  # int64 [R, WORDS], the instruction of each row
+    outcome: torch.Tensor | None  # float32 [R], the standardised return of each row's episode
+
+    @staticmethod
+    def of(recording: Recording, config: ImitationConfig, device: torch.device) -> DemonstrationRows:
+        cache = recording.cache
+        stop, outcome = np.zeros(cache.length, np.int64), None
+        for first, last in cache.episodes:
+            stop[first:last] = last
+        if config.outcome is not None:
+            returns = recording.episode_returns()
+            assert returns is not None
+            each = (returns - returns.mean()) / returns.std()
+            outcome = torch.from_numpy(np.repeat(each, np.diff(cache.ranges, axis=1)[:, 0])).float()
+        words = None
+        if config.vocabulary:
+            texts = WordEncoder(config.vocabulary).read(cache.tasks)
+            words = texts[torch.from_numpy(np.array(cache.arrays["task"]))]
+        actions = config.encode(torch.from_numpy(np.array(cache.action, np.float32)))
+        valid = np.asarray(cache.action_valid).reshape(-1)
+        rows = np.flatnonzero(recording.usable & valid)
+        if not len(rows):
+            raise DatasetError(f"{recording.name} holds no actions to imitate; record demonstrations.")
+        return DemonstrationRows(recording, config, device, rows, stop, actions, words, outcome)
+
+    @property
+    def held_out(self) -> DemonstrationRows:
+        """The same of the held-out episodes; of all where none is held out."""
+        cache, rows = self.recording.cache, np.zeros(self.recording.cache.length, bool)
+        for number in self.recording.held_out:
+            rows[slice(*cache.episodes[number])] = True
+        rows &= np.asarray(cache.action_valid).reshape(-1)
+        return replace(self, rows=np.flatnonzero(rows)) if rows.any() else self
+
+    def sample(self, count: int, rng: np.random.Generator) -> Demonstrations:
+        """`count` moments, drawn uniformly."""
+        return self.at(rng.choice(self.rows, count))
+
+    def at(self, rows: np.ndarray) -> Demonstrations:
+        """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero."""
+        config, cache, start = self.config, self.recording.cache, self.recording.start[rows]
+        back = rows[:, None] - np.arange(config.history - 1, -1, -1)
+        shown = np.maximum(back, start[:, None]).ravel()
+        seen = {}
+        for name, _ in config.actor.sees:
+            array = array_for(name, cache.arrays, cache.keys)
+            assert array is not None
+            seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][shown])).to(self.device)
+        before = torch.from_numpy(np.maximum(back - 1, start[:, None]))
+        acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], self.actions[before], 0.0)
+        ahead = rows[:, None] + np.arange(config.chunk)
+        valid = torch.from_numpy(ahead < self.stop[rows][:, None])
+        ahead = np.minimum(ahead, self.stop[rows][:, None] - 1)
+        valid &= torch.from_numpy(np.asarray(cache.action_valid).reshape(-1)[ahead])
+        chunk, picked = self.actions[torch.from_numpy(ahead)], torch.from_numpy(rows)
+        words, outcome = (None if each is None else each[picked].to(self.device) for each in (self.words, self.outcome))
+        return Demonstrations(seen, acted.to(self.device), chunk.to(self.device), valid.to(self.device), words, outcome)

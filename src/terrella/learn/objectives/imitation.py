@@ -1,0 +1,88 @@
+"""Behaviour cloning of chunks of actions (ACT, Zhao et al. 2023): cross-entropy for choices and buttons, flow matching for axes."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+
+from ...act.imitation_network import AXES, ImitationNetwork
+from ...core.spec import BUTTONS
+from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+
+FORGOTTEN = (
+    0.5  # probability that the own actions are hidden, so that the policy is no copy of them (de Haan et al. 2019)
+)
+SHIFT = 4  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et al. 2020)
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """N moments of demonstrations."""
+
+    seen: Mapping[str, torch.Tensor]  # channel -> [N * history, ...], the oldest step of each moment first
+    acted: torch.Tensor  # [N, history, A], the encoded actions before the moment
+    chunk: torch.Tensor  # [N, chunk, A], the encoded actions from the moment on
+    valid: torch.Tensor  # bool [N, chunk]: within the episode
+    words: torch.Tensor | None = None  # [N, WORDS], the instruction
+    outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
+
+
+class BehaviourCloning:
+    """The chunk that the teacher took, from what it saw."""
+
+    def __init__(self, network: ImitationNetwork, learning_rate: float):
+        self.network = network
+        self.modules = {"network": network}
+        self.learners = {"imitation": adamw((network,), warmup_cosine(learning_rate, 100, 0.02), decay=1e-3)}
+
+    def losses(self, batch: Demonstrations, now: TrainStep) -> Iterator[Loss]:
+        network, config, count = self.network, self.network.config, len(batch.chunk)
+        hidden = torch.from_numpy(now.rng.random(count) < FORGOTTEN).to(batch.acted.device)
+        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now))
+        if config.actor.mode == AXES:
+            data = batch.chunk.flatten(1)
+            time, noise = now.rand(count), now.randn(*data.shape)
+            noisy = torch.lerp(noise, data, time[:, None])
+            error = (network.flow(noisy, time, out) - (data - noise)).square().view(*batch.chunk.shape).mean(2)
+        else:
+            error = chunk_errors(network, out, batch.chunk)
+        loss = (error * batch.valid).sum() / batch.valid.sum()
+        yield Loss("imitation", loss, {"imitation": loss})
+
+
+def condition(
+    network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor, shift: tuple[int, int] = (0, 0)
+) -> torch.Tensor:
+    """What the network makes of moments: logits, or the condition of the flow."""
+    count, history = len(batch.chunk), network.config.history
+    words = None if network.words is None or batch.words is None else network.words(batch.words)
+    every = None if words is None else words.repeat_interleave(history, 0)
+    seen = {name: _moved(value, shift) for name, value in batch.seen.items()} if any(shift) else batch.seen
+    features = network.features(seen, every)
+    return network(features.view(count, history, -1), acted, words, batch.outcome)
+
+
+def chunk_errors(network: ImitationNetwork, logits: torch.Tensor, chunk: torch.Tensor) -> torch.Tensor:
+    """The negative log-likelihood [N, chunk] of encoded chunks of choices or buttons."""
+    actor, shape = network.config.actor, chunk.shape
+    flat, truth = logits.view(shape[0] * shape[1], -1), chunk.flatten(0, 1)
+    if actor.mode == BUTTONS:
+        return F.binary_cross_entropy_with_logits(flat, truth, reduction="none").sum(1).view(shape[:2])
+    parts = zip(flat.split(list(actor.counts), 1), truth.split(list(actor.counts), 1))
+    return sum((F.cross_entropy(a, b.argmax(1), reduction="none") for a, b in parts), flat[:, 0] * 0).view(shape[:2])
+
+
+def _shift(now: TrainStep) -> tuple[int, int]:
+    down, across = now.rng.integers(-SHIFT, SHIFT + 1, 2).tolist()
+    return down, across
+
+
+def _moved(value: torch.Tensor, shift: tuple[int, int]) -> torch.Tensor:
+    """Pictures [N, H, W, C] moved by pixels, with their edges repeated; other values as they are."""
+    if value.ndim != 4 or min(value.shape[1:3]) < 8 * SHIFT:
+        return value
+    rows, columns = (
+        (torch.arange(side, device=value.device) + by).clamp(0, side - 1) for side, by in zip(value.shape[1:3], shift)
+    )
+    return value[:, rows][:, :, columns]

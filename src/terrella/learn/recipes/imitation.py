@@ -1,0 +1,153 @@
+"""train policy --method imitation: a policy from a recording's demonstrations; see objectives/imitation.py."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...act.actor import RUN_SUBFOLDER
+from ...act.actor_network import ActorConfig
+from ...act.imitation import ImitationActor
+from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork
+from ...act.sentences import vocabulary_of
+from ...core.errors import DatasetError, TrainingError
+from ...core.spec import kind_of
+from ...data import Dataset
+from ...data.channels import ESTIMATES
+from ...data.training.cache import array_for
+from ..copycat import copycat
+from ..demonstrations import DemonstrationRows
+from ..feeds import RandomBatches
+from ..objectives.imitation import BehaviourCloning
+from ..recording import Recording
+from ..trainer import Report, Run, Trainer, device_named
+from .policy import DEFAULT_MINUTES, ENDLESS, Practice
+
+STAGE = "imitation"
+NOT_SEEN = {"action", "reward", "done", "truncated", "depth", "pose", "latent", "expert", *ESTIMATES}
+DISCRETE_CHUNK, AXES_CHUNK = 1, 8  # default chunk of actions
+TESTED = 2048  # moments of the final test
+
+
+@dataclass(frozen=True)
+class Imitation:
+    """Settings of imitation beside those of every policy."""
+
+    picture_size: tuple[int, int] = (64, 64)  # Height and width to which pictures are resized.
+    history: int = 2  # Observations that the policy sees, the last ones.
+    own_actions: bool = False
+    """Let the policy see its own last actions as well. Half of the time they are hidden in training."""
+    chunk: int | None = None  # Actions that it predicts at once. Default: 8, for buttons and choices 1.
+    execute: int | None = None  # Of these, actions that it takes before it predicts anew. Default: half of the chunk.
+    outcome: bool = False
+    """Condition the policy on the return of the episode and ask for the best: failures teach what not to do."""
+
+
+def train_imitation(
+    recording: str | Path,
+    out: str | Path,
+    practice: Practice,
+    imitation: Imitation,
+    report: Report,
+    device: str = "auto",
+) -> dict[str, Any]:
+    """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
+    verdict on held-out episodes. DatasetError or TrainingError for what cannot be imitated."""
+    out, batch = Path(out), practice.batch or 256
+    _check(practice, imitation)
+    opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
+    settings = {**asdict(imitation), "recording": str(recording)}
+    run = Run.of(out, practice, report, device_named(device), ("minutes",), **settings)
+    run.saved_facts(STAGE)
+    torch.manual_seed(practice.seed)
+    network = ImitationNetwork(config_of(opened, sees, practice.hidden, imitation)).to(run.device)
+    rows = DemonstrationRows.of(opened, network.config, run.device)
+    network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
+    objective = BehaviourCloning(network, practice.learning_rate)
+    feed = RandomBatches(lambda now: rows.sample(batch, now.rng))
+    trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
+    trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
+    card = {"what": f"A policy that imitates {recording}", "learned_from": str(recording), "sees": list(sees)}
+
+    def save() -> None:
+        ImitationActor.write(network, out / RUN_SUBFOLDER, card)
+
+    try:
+        trainer.train(save)
+    finally:
+        save()
+    tested = copycat(network.eval(), rows.held_out, TESTED)
+    return {**trainer.summary, **card, **tested, "policy": str(out / RUN_SUBFOLDER)}
+
+
+def open_demonstrations(
+    recording: str | Path, sees: Sequence[str], size: tuple[int, int], report: Report
+) -> tuple[Recording, tuple[str, ...]]:
+    """The recording, and the channels that a policy sees of it: these, or by default all cameras, codes and numbers."""
+    dataset = Dataset(recording)
+    cameras = [name for name in (sees or dataset.channels) if dataset.feature(name) in dataset.cameras]
+    opened = Recording.open(
+        dataset, size, report, needs=("action",), why="a policy imitates the actions of a recording", cameras=cameras
+    ).require_rows()
+    cache = opened.cache
+    if not sees:
+        usual = [
+            name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN and _shape(opened, name) is not None
+        ]
+        sees = tuple(name for name in usual if len(_shape(opened, name) or ()) in (0, 1, 3))
+    for name in sees:
+        if name in NOT_SEEN - {"pose", "latent", "expert"} or _shape(opened, name) is None:
+            known = ", ".join(name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN)
+            raise DatasetError(f"a policy cannot see '{name}' of {opened.name}; it has {known or 'nothing to see'}.")
+    if not sees:
+        raise DatasetError(f"{opened.name} has neither pictures nor numbers that a policy could see.")
+    return opened.having(name for name in sees), tuple(sees)
+
+
+def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: Imitation) -> ImitationConfig:
+    """The network's shape, by the recording's channels, actions and instructions."""
+    controls = opened.controls
+    assert controls is not None
+    mode, action_shape = controls.kind, opened.cache.world.get("action_shape")
+    shape = tuple(action_shape) if action_shape is not None else (len(controls.low),)
+    seen = tuple((name, _shape(opened, name) or ()) for name in sees)
+    actor = ActorConfig(seen, mode, shape, controls.low, controls.high, hidden)
+    chunk = imitation.chunk or (AXES_CHUNK if mode == AXES else DISCRETE_CHUNK)
+    execute = imitation.execute or max(1, chunk // 2)
+    if execute > chunk:
+        raise TrainingError(f"--execute {execute}: at most the {chunk} actions of --chunk can be taken.")
+    tasks = opened.cache.tasks if len(set(opened.cache.tasks)) > 1 else ()
+    return ImitationConfig(
+        actor, imitation.picture_size, vocabulary_of(tasks), imitation.history, imitation.own_actions, chunk, execute,
+        best_outcome(opened) if imitation.outcome else None,
+    )  # fmt: skip
+
+
+def best_outcome(opened: Recording) -> float:
+    """The standardised return that a policy asks for, that of the best tenth. DatasetError where all returns are the same."""
+    returns = opened.episode_returns()
+    if returns is None or np.ptp(returns) < 1e-6:
+        what = "has no rewards" if returns is None else f"ends every episode with the return {returns[0]:.3g}"
+        raise DatasetError(f"{opened.name} {what}: there are no outcomes to condition on; leave --outcome out.")
+    return float((np.quantile(returns, 0.9) - returns.mean()) / returns.std())
+
+
+def _shape(opened: Recording, name: str) -> tuple[int, ...] | None:
+    """The shape of a row of a channel; None where the recording has none of this name."""
+    cache = opened.cache
+    array = array_for(name, cache.arrays, cache.keys)
+    return None if array is None else tuple(cache.arrays[array].shape[1:])
+
+
+def _check(practice: Practice, imitation: Imitation) -> None:
+    counts = (imitation.history, imitation.chunk or 1, imitation.execute or 1, practice.hidden, practice.batch or 1)
+    if min(*counts, practice.steps or 1) < 1 or not (practice.minutes is None or practice.minutes > 0):
+        raise TrainingError(
+            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, and --minutes is above 0."
+        )
