@@ -31,7 +31,7 @@ GAMES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "gym:ALE/Pong-v5": (("ale_py",), "pip install 'terrella[atari]'", "any Atari game, by its id"),
     "mujoco:arm": (
         ("mujoco",), "pip install 'terrella[mujoco]'",
-        "an arm; also car, drone, ant, humanoid, or any MJCF or URDF: mujoco:FILE.xml",
+        "an arm; also car (car:road: in a town), drone, ant, humanoid, or any MJCF or URDF: mujoco:FILE.xml",
     ),
     "mujoco:go1": (
         ("mujoco", "mjlab"), "pip install 'terrella[mujoco]' && pip install --no-deps mjlab==1.6.0",
@@ -60,7 +60,8 @@ def load(
     """Opens a world.
 
     name:      a bundled world ("doom-maze"), the real game ("doom:my_way_home"), a Gymnasium environment ("gym:CartPole-v1"), a
-               robot in MuJoCo ("mujoco:go1", "mujoco:FILE.xml"), or the path of a checkpoint folder or of a training run.
+               robot in MuJoCo ("mujoco:go1", "mujoco:car:road", "mujoco:FILE.xml"), or the path of a checkpoint folder or of a
+               training run.
     remember:  adds a spatial memory (space/remembering.py) to a world without one.
     estimator: a file of `terrella train estimator`, or a world that has one: it estimates pose and depth for the memory, which
                it implies.
@@ -99,7 +100,8 @@ def load(
         _require("mujoco", "MuJoCo's worlds need mujoco", "mujoco")
         from .sim.mujoco_world import MujocoConfig, MujocoWorld
 
-        return MujocoWorld(text.partition(":")[2], MujocoConfig(**options))
+        robot, _, task = text.partition(":")[2].partition(":")
+        return MujocoWorld(robot, MujocoConfig(**({"task": task} if task else {}), **options))
     if text.startswith("gym:"):
         return _open_gymnasium(*_id_and_repeat(text), options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})

@@ -29,16 +29,16 @@ from terrella.worlds.folder import load_world, save_world
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
     "learn": "--action-names --adapter --fps --frames --generator --idle --json --keys --minutes --out --practise "
-    "--randomise --seed --size",
+    "--randomise --seed --size --task",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
-    "--pictures --policy --port --randomise --seed --size --workers",
+    "--pictures --policy --port --randomise --seed --size --task --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
     "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
-    "--seed --size --spread --steps --success --temperature --trust --within",
+    "--seed --size --spread --steps --success --task --temperature --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

@@ -20,14 +20,16 @@ from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
 from .actor import policy_folder, read_policy
 from .belief import load_learned_policy
+from .driver import driver_of
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
 
 POLICY_NAMES = (
-    "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, the folder of a learned policy, MODULE:NAME or "
-    "FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by random ones"
+    "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, driver or driver:QUALITY (of 0 to 1, where a "
+    "world has a route), the folder of a learned policy, MODULE:NAME or FILE.py:NAME of your own; NAME@0.3 replaces "
+    "three actions in ten by random ones"
 )
 _DEFAULTS = {field.name: field.default for field in fields(SearchConfig)}
 _SETTINGS = {name: type(value) if isinstance(value, str | int) else float for name, value in _DEFAULTS.items()}
@@ -83,13 +85,15 @@ def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None
         return simple[head](spec)
     if head == "constant":
         return Constant(_action(rest, spec))
+    if head == "driver":
+        return driver_of(rest, spec)
     if head == "plan":
         return _planner(name, rest, world, cost)
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
         return load_learned_policy(name, spec, world, cost)
-    hint = did_you_mean(name, [*simple, "constant", "plan"]) or "."
+    hint = did_you_mean(name, [*simple, "constant", "plan", "driver"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{hint} There are: {POLICY_NAMES}.")
 
 

@@ -2,6 +2,7 @@
 
 # pyright: reportAttributeAccessIssue=false
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -14,6 +15,8 @@ TILES = 8  # pictures per side of the tiled image
 SMALL = 128  # pixels per side up to which a picture is rendered in a simpler way
 _SLICES, _STACKS = 12, 8  # of round geoms in small pictures
 _PLAIN = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # disabled: they take most of the time
+_HIDDEN = 5  # a group of geoms that is not drawn
+_FINEST = 0.3  # radius in pixels of the smallest geoms that are drawn
 _WIDE_M, _GRID_M = 32.0, 0.5  # half width of an infinite floor, and size of its separately lit cells
 
 
@@ -43,8 +46,10 @@ class Canvas:
         """Renders a world onto the next tile, after `decorate` has changed the scene."""
         height, width = self._size
         self._camera.fixedcamid = self._model.camera(camera).id
-        every = mujoco.mjtCatBit.mjCAT_ALL
+        every, groups = mujoco.mjtCatBit.mjCAT_ALL, self._model.geom_group.copy()
+        self._model.geom_group[~_within(self._model, data, self._camera.fixedcamid, self._size)] = _HIDDEN
         mujoco.mjv_updateScene(self._model, data, self._option, self._perturb, self._camera, every, self._scene)
+        self._model.geom_group[:] = groups
         decorate(self._scene)
         for flag in _PLAIN:
             self._scene.flags[flag] = 0
@@ -76,6 +81,21 @@ class Canvas:
     def __del__(self):
         with suppress(Exception):
             self.close()
+
+
+def _within(model: Any, data: Any, camera: int, size: tuple[int, int]) -> np.ndarray:
+    """bool [ngeom]: geoms whose bounding sphere is within a camera's view and not tiny, for each costs time (culling)."""
+    radius, bounded = model.geom_rbound, model.geom_rbound > 0
+    if model.cam_sensorsize[camera].any() or model.cam_projection[camera] != int(
+        mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    ):
+        return np.ones_like(bounded)
+    across, up, back = ((data.geom_xpos - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
+    half = math.tan(math.radians(float(model.cam_fovy[camera])) / 2)
+    seen = radius * size[0] >= 2 * half * _FINEST * -back
+    for offset, slope in ((across, half * size[1] / size[0]), (up, half)):
+        seen &= np.abs(offset) <= slope * -back + radius * math.hypot(1, slope)
+    return seen | ~bounded
 
 
 def simplify(model: Any, size: tuple[int, int]) -> None:

@@ -4,7 +4,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,9 +12,12 @@ import numpy as np
 
 from ..core.errors import TerrellaError
 from ..core.similar import did_you_mean
+from .mujoco_driving import Driving
 from .mujoco_model import FREE, add_floor, mujoco, read
 from .mujoco_pilot import Multirotor
 from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracking
+from .mujoco_town import YAWS_DEG, build_town
+from .road_network import road_network
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
@@ -56,6 +59,10 @@ class Robot:
     units: tuple[str, ...] = ()  # of actions, where the file does not define them
     pilot: type[Multirotor] | None = None  # turns actions into controls
     sky: bool = True  # whether a sky is added with the floor
+    cameras: tuple[str, ...] = ()  # that are shown by default, the main one first; default: the file's first
+    size: tuple[int, int] = (96, 128)  # height and width of pictures by default
+    # name of a task -> the robot with it, in surroundings by a seed
+    tasks: Mapping[str, Callable[["Robot", int], "Robot"]] = field(default_factory=dict)
 
     def spec(self, name: str) -> mujoco.MjSpec:
         """The robot's spec with all additions. TerrellaError where the wheel is not installed."""
@@ -75,6 +82,16 @@ class Robot:
                 spec.geom("floor").contype, spec.geom("floor").conaffinity = 1, 0
         self.adds(spec)
         return spec
+
+    def with_task(self, text: str) -> "Robot":
+        """The robot with a task by name, or NAME:SEED where it makes its surroundings. TerrellaError for an unknown one."""
+        name, colon, seed = text.partition(":")
+        if name not in self.tasks or colon and not seed.isdecimal():
+            raise TerrellaError(
+                f"this robot has no task '{text}'{did_you_mean(name, self.tasks) or '.'} It has "
+                f"{', '.join(f'{one}, {one}:SEED' for one in self.tasks) or 'none by name'}."
+            )
+        return self.tasks[name](self, int(seed or 0))
 
     def rest(self, joint: str) -> float:
         """The position of a joint at rest, rad or m."""
@@ -165,6 +182,16 @@ def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
     return add
 
 
+def _on_roads(car: Robot, seed: int) -> Robot:
+    """A car in the town of this seed."""
+    roads = road_network(seed)
+    return replace(
+        car, what="a car on the roads of a made-up town, among cars and walkers, with three cameras", task=Driving(roads),
+        adds=lambda spec: build_town(spec, roads, seed), step_s=0.01, control_s=0.1, max_steps=400,
+        cameras=tuple(YAWS_DEG), size=(48, 64),
+    )  # fmt: skip
+
+
 TABLE_M = 0.75  # height of the arm's table
 _LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # axes of its camera
 _LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)
@@ -233,6 +260,7 @@ ROBOTS: Mapping[str, Robot] = {
             "KeyA": [0.5, 0], "KeyD": [-0.5, 0], "KeyW": [0, 2.5], "KeyS": [0, -1],
         },
         units=("rad", "m/s"),
+        tasks={"road": _on_roads},
     ),
     "ant": Robot(
         GYMNASIUM + "ant.xml", "Gymnasium's ant, four legs with motors", VelocityTracking(fallen=(1.5, 0.35)), max_steps=1000

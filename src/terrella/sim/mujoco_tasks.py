@@ -52,6 +52,9 @@ class Free:
 
     rewards = False
 
+    def __repr__(self) -> str:  # of a world's fingerprint
+        return "Free()"
+
     def channels(self, layout: RobotLayout) -> Spaces:
         width = (
             len(layout.home)

@@ -45,13 +45,15 @@ _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 class MujocoConfig:
     """The settings of a MujocoWorld."""
 
-    # Reward and termination (sim/mujoco_tasks.py). Default: the robot's own, or the one that the file declares.
-    task: RobotTask | None = None
+    # Reward and termination (sim/mujoco_tasks.py), or the name of one of the robot's tasks: "road" or "road:SEED" of the car.
+    # Default: the robot's own, or the one that the file declares.
+    task: RobotTask | str | None = None
     # Seconds of a control step, rounded to physics steps. Default: the robot's own, else 0.02.
     control_s: float | None = None
-    # (height, width) of pictures.
-    size: tuple[int, int] = (96, 128)
-    # Names of cameras of the model: the first is `rgb`, others are `rgb.NAME`. Default: the model's first; () for none.
+    # (height, width) of pictures. Default: the robot's own, else 96 x 128.
+    size: tuple[int, int] | None = None
+    # Names of cameras of the model: the first is `rgb`, others are `rgb.NAME`. Default: the robot's own, else the model's first; ()
+    # for none.
     cameras: Sequence[str] | None = None
     # Show depth for each camera.
     depth: bool = False
@@ -90,6 +92,11 @@ class MujocoWorld:
     def __init__(self, name: str | Path | Robot, config: MujocoConfig = MujocoConfig()):
         label = name.file if isinstance(name, Robot) else str(name)
         robot = name if isinstance(name, Robot) else None if label.endswith(FILES) else robot_of(label)
+        task = config.task
+        if isinstance(task, str):
+            if robot is None:
+                raise TerrellaError(f"only ready robots have tasks by name; {label} declares its own.")
+            label, robot, task = f"{label}:{task}", robot.with_task(task), None
         spec = complete(read(label) if robot is None else robot.spec(label), label)
         self._source, self._seen = spec, compiled(spec, label)
         self.file = bare(spec, self._seen, label)
@@ -102,12 +109,14 @@ class MujocoWorld:
         self._dumps = Path(config.dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}")
         home = _home(self.file, robot)
         self._controls = controls_of(self.file, home)
-        self.task: RobotTask = config.task or (robot.task if robot else task_of(spec, label))
+        self.task: RobotTask = task or (robot.task if robot else task_of(spec, label))
         self.layout = _layout(self.file, home, self._controls, self._steps)
-        self._cameras = _cameras(self._seen, config.cameras)
+        wanted = config.cameras if config.cameras is not None or robot is None else robot.cameras or None
+        self._cameras = _cameras(self._seen, wanted)
         shown = (("depth", config.depth), ("segmentation", config.segmentation))
         self._kinds = ("rgb", *(kind for kind, wanted in shown if wanted))
-        self._size, self._limit = (int(config.size[0]), int(config.size[1])), robot.max_steps if robot else None
+        height, width = config.size or (robot.size if robot else (96, 128))
+        self._size, self._limit = (int(height), int(width)), robot.max_steps if robot else None
         self._pilot = robot.pilot(self.file) if robot and robot.pilot and config.pilot else None
         has_lidar = SITE in {site.name for site in spec.sites}
         self._lidar = Lidar(self.file, config.lidar, config.lidar_m) if has_lidar else None
@@ -160,7 +169,7 @@ class MujocoWorld:
         after = {"physics": physics, "sensors": sensors}
         reward, fallen, kept = self.task.evaluate(self.layout, before, {**dict(state.items()), **after})
         reward = reward.masked_fill(before["done"], 0.0)
-        return state.replace(**after, **kept, reward=reward, done=state["done"] | fallen)
+        return state.replace(**{**after, **kept}, reward=reward, done=state["done"] | fallen)
 
     def fingerprint(self) -> str:
         """The model, the task and the version of MuJoCo as text: worlds with the same text are the same world."""
@@ -221,7 +230,7 @@ class MujocoWorld:
             )
         after = {"physics": physics, "sensors": sensors, "warmstart": warmstart, "ctrl": ctrl}
         reward, fallen, kept = self.task.evaluate(self.layout, state, {**dict(state.items()), **after})
-        return state.replace(**after, **kept, reward=reward.masked_fill(unstable, 0.0), done=fallen | unstable)
+        return state.replace(**{**after, **kept}, reward=reward.masked_fill(unstable, 0.0), done=fallen | unstable)
 
     def _dump(self, state: State, action: torch.Tensor) -> None:
         """Saves the states before an unstable step with their actions, and warns."""

@@ -49,6 +49,8 @@ class EnvironmentConfig:
     """Steps per second of a Gymnasium environment, not counting the action repeat N of gym:ID@N; default: as declared, or 10."""
     adapter: str | None = None
     """A Python file (FILE.py or FILE.py:NAME) with an Adapter that finds depth, poses and more."""
+    task: str | None = None
+    """A task of a ready robot: `road` or `road:SEED` (another town) of mujoco:car; the same as the name mujoco:car:road."""
     randomise: str | None = None
     """A TOML or JSON file of distributions, from which each episode of a simulator draws masses, friction, delay and more."""
 
@@ -59,6 +61,10 @@ class EnvironmentConfig:
         from ..core.errors import TerrellaError
         from ..sim import randomised
 
+        if self.task is not None:
+            if not name.startswith("mujoco:"):
+                raise TerrellaError("--task is for the robots of MuJoCo; other worlds have one task.")
+            name = f"{name}:{self.task}"
         if self.fps is not None and not 0 < self.fps < 10_000:
             raise TerrellaError(
                 f"--fps {self.fps:g} is no number of steps per second; give the rate at which a person plays, as in --fps 15."
@@ -66,7 +72,7 @@ class EnvironmentConfig:
         if name.startswith("gym:ALE/") and (self.fps or self.adapter):
             raise TerrellaError("Atari games have a clock and names of their own; leave --fps and --adapter out.")
         if self.randomise is not None:
-            world: World = replace(self, randomise=None).open(name, forkable, rgb)
+            world: World = replace(self, randomise=None, task=None).open(name, forkable, rgb)
             return randomised.Randomised(world, randomised.read(self.randomise))
         options: dict[str, Any] = {"size": self.size} if self.size else {}
         options |= {"dt_s": 1 / self.fps} if self.fps else {}
