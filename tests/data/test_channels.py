@@ -236,3 +236,5 @@ def test_a_recording_of_another_game_is_known_by_what_it_says_of_itself(recorded
         assert check_game(Dataset(tmp_path), learned) == ""
         other = replace(learned, card={"game": "chess"})
         assert "is of game; learned learned chess" in check_game(Dataset(tmp_path), other)
+        slower = replace(learned, dt_s=0.2)
+        assert "has 10 steps a second; learned learned 5." in check_game(Dataset(tmp_path), slower)

@@ -14,7 +14,7 @@ def check_game(dataset: Dataset, spec: Spec) -> str:
     """Checks that a world can be trained and scored on a recording.
 
     DatasetError where the recording has no actions, other actions, or no pictures for a world that observes pictures.
-    Returns a warning where it fits but its metadata names another game, else "".
+    Returns a warning where it fits but its metadata names another game, or it has other steps a second, else "".
     """
     about: dict[str, Any] = dataset.world
     mine: dict[str, Any] = facts_of(spec)
@@ -34,6 +34,9 @@ def check_game(dataset: Dataset, spec: Spec) -> str:
         why = f"holds no pictures, which {spec.name} observes"
     if why:
         raise DatasetError(f"{dataset.root} {why}: score and train a world on recordings of its own game.")
+    rate = 1 / spec.dt_s
+    if abs(dataset.fps - rate) > 0.02 * rate:
+        return f"{dataset.root} has {dataset.fps:.3g} steps a second; {spec.name} learned {rate:.3g}."
     differs = game and learned and game != learned
     return f"{dataset.root} is of {game}; {spec.name} learned {learned}." if differs else ""
 

@@ -211,7 +211,7 @@ def _open_cache(data: Path, world: World, progress: Progress, report: Report | N
     """The recording's ClipCache at the size that the world renders. DatasetError for recordings of another game."""
     dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
     if doubt := check_game(dataset, world.spec):
-        progress(f"{doubt} Figures of another game say little.")
+        progress(f"{doubt} Figures of another game, or of other steps, say little.")
     for channel in world.spec.kinds("rgb"):
         height, width, _ = world.spec.channels[channel].shape or (0, 0, 3)
         feature = dataset.channels.get(channel)
