@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .learn.recipes.policy import Practice
     from .learn.recipes.video import TrainConfig
     from .library import as_sb3, load, load_policy, worlds
+    from .workflows.check import CheckConfig, CheckResult, check
     from .workflows.collect import CollectConfig, CollectResult, collect
     from .workflows.evaluate import EvaluateConfig, EvaluateResult, evaluate
     from .workflows.learn import LearnConfig, LearnResult, learn
@@ -42,6 +43,7 @@ _NAMES = {
     ".learn.recipes.policy": ("Practice",),
     ".learn.recipes.video": ("TrainConfig",),
     ".library": ("as_sb3", "load", "load_policy", "worlds"),
+    ".workflows.check": ("CheckConfig", "CheckResult", "check"),
     ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
     ".workflows.evaluate": ("EvaluateConfig", "EvaluateResult", "evaluate"),
     ".workflows.learn": ("LearnConfig", "LearnResult"),

@@ -29,6 +29,9 @@ GAMES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "gym:Islet-v0": ((), "", "a walk over an island, a small game of our own"),
     "gym:CartPole-v1": (("pygame",), "pip install 'terrella[sim]'", "any Gymnasium environment, by its id"),
     "gym:ALE/Pong-v5": (("ale_py",), "pip install 'terrella[atari]'", "any Atari game, by its id"),
+    "physics:bouncing": (
+        (), "", "a ball that bounces; also uniform, parabola, collision, pendulum, rolling, and stacking (with MuJoCo)",
+    ),
     "mujoco:arm": (
         ("mujoco",), "pip install 'terrella[mujoco]'",
         "an arm; also car (car:road: in a town), drone, ant, humanoid, or any MJCF or URDF: mujoco:FILE.xml",
@@ -102,6 +105,8 @@ def load(
 
         robot, _, task = text.partition(":")[2].partition(":")
         return MujocoWorld(robot, MujocoConfig(**({"task": task} if task else {}), **options))
+    if text.startswith("physics:"):
+        return _open_bodies(*text.split(":")[1:], **options)
     if text.startswith("gym:"):
         return _open_gymnasium(*_id_and_repeat(text), options)
     return _open_checkpoint(folder_of(name), options | {"memory_mb": memory_mb})
@@ -130,6 +135,20 @@ def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:
 
         options = {"snapshots": MujocoSnapshots, **options}
     return GymnasiumWorld(env, GymnasiumConfig.of(repeat=repeat, **options))
+
+
+def _open_bodies(family: str, split: str = "in", *rest: str, **options: Any) -> World:
+    """physics:FAMILY or physics:FAMILY:out, a family of moving bodies."""
+    from .sim.bodies import BodiesConfig, BodiesWorld
+
+    if rest:
+        raise TerrellaError("a family of bodies is physics:NAME, or physics:NAME:out beyond the ranges of training.")
+    if family == "stacking":
+        _require("mujoco", "Stacking needs mujoco", "mujoco")
+        from .sim.stacking import stacking
+
+        return stacking(split, **options)
+    return BodiesWorld(family, BodiesConfig(**{"split": split, **options}))
 
 
 def as_sb3(world: World, num_envs: int = 1, **options: Any) -> VecEnv:
@@ -165,7 +184,7 @@ def load_adapter(source: str) -> Adapter:
 
 def is_truth(name: str | Path) -> bool:
     """Whether this is the name of a game or an environment, not of a learned world."""
-    return str(name).partition(":")[0] in ("doom", "gym", "mujoco")
+    return str(name).partition(":")[0] in ("doom", "gym", "mujoco", "physics")
 
 
 def folder_of(name: str | Path) -> Path:

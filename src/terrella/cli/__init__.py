@@ -46,6 +46,7 @@ COMMANDS = {
     "train dreams": ("train:dreams", "continue training a world on its own rollouts"),
     "export policy": ("export:policy", "write a learned policy as an ONNX file that runs without PyTorch"),
     "score": ("score:score", "compare a world's predictions with a recording"),
+    "check": ("physics:check", "check which laws of physics a world's predictions keep"),
     "space fit": ("space:fit", "fit a place of Gaussians to a recording, photographs or a video"),
     "space build": ("space:build", "build a place to walk in from a sentence or a layout of rooms and furniture"),
     "space import": ("space:import_", "import a file of another tool as a world (.ply, .spz, .sog, .glb)"),

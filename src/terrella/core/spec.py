@@ -104,6 +104,8 @@ class Spec:
     may_observe: tuple[str, ...] = ()  # channels that `observe` uses where the observation has them
     idle: tuple[float, ...] = ()  # the flat action that does nothing, where its name and mode do not say which one does
     leap: int = 0  # steps that `leap` advances at once (core/world.py); 0 for worlds without it
+    system: Mapping[str, object] = field(default_factory=dict)
+    """Bodies, walls and limits for the laws of physics, JSON values (physics/system.py); {} where they are unknown."""
 
     def __post_init__(self):
         if not self.action_mode:

@@ -135,7 +135,7 @@ def facts_of(spec: Spec) -> dict[str, object]:
         "idle": [float(number) for number in spec.idle], "max_episode_steps": spec.max_episode_steps,
         "left_out": dict(_mapping(spec, "left_out")), "renamed": dict(_mapping(spec, "renamed")),
         "units": dict(spec.units), "discrete": isinstance(spec.action, spaces.Discrete | spaces.MultiDiscrete),
-        **limits,
+        **({"system": dict(spec.system)} if spec.system else {}), **limits,
     }  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from ..core.errors import ObservationError, StaleStateError, TerrellaError
 from ..core.spec import DONE, EVENT, POSE, POSE_UNIT, REWARD, Camera, Spec
 from ..core.state import State
 from .doom_map import Sectors, map_names, skies
+from .doom_system import doom_system
 
 UNITS_PER_M = 32.0
 TICS_PER_S = 35
@@ -119,8 +120,17 @@ class Doom:
             cameras={"rgb": Camera(CAMERA, config.size)},
             forkable=False,
             max_batch=1,
+            system=self._system(),
             card={"what": f"ViZDoom's {config.scenario} with Freedoom's art: the real game", "kind": "simulator"},
         )
+
+    def _system(self) -> dict[str, object]:
+        """The player and the walls, where there is one map."""
+        state = self._game.get_state()
+        if self._maps or state is None:
+            return {}
+        walls = Sectors(state.sectors, skies(self._wad, self._game.get_doom_map()))
+        return doom_system(walls.lines[walls.solid], UNITS_PER_M).to_json()
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """A new episode; `rng` draws the map and the spawn point where there are several."""

@@ -273,6 +273,9 @@ ROBOTS: Mapping[str, Robot] = {
         OWN + "arm.xml", "an arm of two joints in a vertical plane that holds its hand at a point", Hold(), max_steps=150, sky=False
     ),
     "arm-real": Robot(OWN + "arm_real.xml", "the same arm with another integrator", Hold(), max_steps=150, sky=False),
+    "blocks": Robot(
+        OWN + "blocks.xml", "an arm that pushes a block and two balls on a table", max_steps=200, sky=False, units=("rad", "rad")
+    ),
     "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),
 }  # fmt: skip
 

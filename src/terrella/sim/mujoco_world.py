@@ -31,6 +31,7 @@ from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_renderer import MujocoRenderer, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
+from .mujoco_system import system_of
 from .mujoco_tasks import MARKER, RobotLayout, RobotTask, numbers, task_of
 from .mujoco_warp import WarpStepper
 
@@ -122,9 +123,18 @@ class MujocoWorld:
         self._lidar = Lidar(self.file, config.lidar, config.lidar_m) if has_lidar else None
         self._keys, self._units = (dict(robot.keys), robot.units) if robot else ({}, ())
         self.parameters = parameters_of(self._seen)
+        system = system_of(self.file)
+        self._system = system.to_json() if system else {}
         self._what = robot.what if robot else f"the model {Path(label).name}"
         self._lock = threading.Lock()
         self._vary(tuple(config.parameters))
+
+    def named(self, name: str, max_steps: int) -> MujocoWorld:
+        """The same world under another name, with a limit of steps."""
+        other = copy(self)
+        other.name, other._limit, other._lock = name, max_steps, threading.Lock()
+        other.spec = other._describe()
+        return other
 
     def _vary(self, names: Sequence[str]) -> None:
         """Makes these parameters differ between worlds, and builds the stepper and the renderer for them."""
@@ -345,6 +355,7 @@ class MujocoWorld:
             # Where the field of view differs between worlds, the Spec has no intrinsics, because one set would be wrong.
             cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
+            system=self._system,
             card={
                 "what": self._what, "kind": "simulator", "physics": _physics_text(model, self._steps), "varied": list(self.varied),
                 "together": True, **({"notes": notes} if notes else {}),

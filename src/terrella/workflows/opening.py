@@ -83,6 +83,8 @@ class EnvironmentConfig:
             if "dt_s" in options:
                 options["control_s"] = options.pop("dt_s")
             return library.load(name, **options) if rgb else library.load(name, cameras=(), **options)
+        if name.startswith("physics:") and not options:
+            return library.load(name, pictures=rgb)
         if options and not name.startswith("gym:"):
             raise TerrellaError(
                 "--size, --fps and --adapter are for environments and MuJoCo; other worlds are as they are."
@@ -92,7 +94,7 @@ class EnvironmentConfig:
         if not rgb:
             if not name.startswith("gym:") or name.startswith("gym:ALE/"):
                 raise TerrellaError(
-                    f"{name} always draws its pictures; only other gym: and mujoco: environments go without."
+                    f"{name} always draws its pictures; only other gym:, mujoco: and physics: environments go without."
                 )
             options["rgb"] = False
         return library.load(name, **options)

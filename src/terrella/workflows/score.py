@@ -166,7 +166,7 @@ def exam_of(
     """The exam, with clips of ground that training saw and of ground that it did not, and its identity. Reading the recordings is
     shown by `report`, or as a stage of its own."""
     world, seed = next(iter(request.arms.values())), request.seed
-    cache = _open_cache(request.data, world, progress, report)
+    cache = open_cache(request.data, world, progress, report)
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
     every = range(len(cache.episodes))
     held_out = every if request.fresh else split(len(every))[1]
@@ -177,7 +177,7 @@ def exam_of(
         )
     sources: dict[str, tuple] = {"recorded": (cache, held_out, out_of_sight(*box) if box else None)}
     if request.new is not None:
-        unseen = _open_cache(request.new, world, progress)
+        unseen = open_cache(request.new, world, progress)
         sources["new"] = (unseen, range(len(unseen.episodes)), None)
     elif box:
         sources["new"] = (cache, every, in_box(*box))
@@ -207,7 +207,7 @@ def exam_of(
     return Exam(request.arms, sets, config, seed, going, album, request.closing), f"{__version__} {paths} "
 
 
-def _open_cache(data: Path, world: World, progress: Progress, report: Report | None = None) -> Any:
+def open_cache(data: Path, world: World, progress: Progress, report: Report | None = None) -> Any:
     """The recording's ClipCache at the size that the world renders. DatasetError for recordings of another game."""
     dataset, sizes = Dataset(data), dict[tuple[int, int], list[str]]()
     if doubt := check_game(dataset, world.spec):

@@ -1,0 +1,21 @@
+"""Laws that a rollout must obey, with tolerances that are calibrated on the truth."""
+
+from .certificates import Certificates, certify
+from .laws import LAWS, Law
+from .system import PhysicalSystem, RigidBody, Rod, Slot, Wall
+from .tolerance import Tolerance, calibrate
+from .trajectory import Trajectory, trajectory_of
+
+__all__ = [
+    "LAWS",
+    "Certificates",
+    "Law",
+    "Trajectory",
+    "PhysicalSystem",
+    "RigidBody",
+    "Rod",
+    "Slot",
+    "Tolerance",
+    "Wall",
+]
+__all__ += ["calibrate", "certify", "trajectory_of"]

@@ -1,0 +1,85 @@
+"""Constants of nature estimated from motion: gravity, restitution, friction."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .laws.free_fall import ballistic
+from .laws.support import floor_forces
+from .trajectory import Trajectory
+
+SLIDES = 0.05  # m/s at the point of contact, above which friction is kinetic
+IMPACT = 5.0  # times what gravity changes in a step: approaching speeds of which a bounce is measured
+
+
+@dataclass(frozen=True)
+class PhysicalConstant:
+    """A constant and how it is estimated: motion -> one value for each rollout [B], NaN where it shows none."""
+
+    name: str
+    unit: str
+    estimate: Callable[[Trajectory], Tensor]
+
+
+def gravity(motion: Trajectory) -> Tensor:
+    """The mean acceleration of bodies in flight along gravity [B], m/s2."""
+    down = motion.gravity / motion.gravity.norm().clamp_min(1e-12)
+    pull = (motion.velocity.diff(dim=0) @ down) / motion.dt_s
+    return _mean(pull, ballistic(motion) & bool(motion.gravity.norm() > 0))
+
+
+def restitution(motion: Trajectory) -> Tensor:
+    """The median over bounces from walls of the normal speed after over that before [B], corrected for gravity within the step."""
+    values, masks = [], []
+    speed_of_fall = motion.gravity.norm() * motion.dt_s
+    for at, wall in enumerate(motion.system.walls):
+        if wall.normal is None:
+            continue
+        normal = motion.position.new_tensor(wall.normal)
+        speed, gap = motion.velocity @ normal, motion.wall_gaps[..., at]
+        pull = motion.gravity @ normal
+        before, after = -speed[:-1], speed[1:]
+        share = (gap[:-1].clamp_min(0) / before.clamp_min(1e-9) / motion.dt_s).clamp(0, 1)
+        arrives = before - pull * share * motion.dt_s
+        leaves = after - pull * (1 - share) * motion.dt_s
+        hits = motion.walls_touched[..., at] & (motion.walls_touched.sum(-1) == 1) & ~motion.bodies_touched.any(-1)
+        fast = (before > IMPACT * speed_of_fall.clamp_min(0.02)) & (after > 0)
+        values.append(leaves / arrives.clamp_min(1e-9))
+        masks.append(hits & fast & motion.both_present & ~motion.driven & ~motion.tied)
+    if not values:
+        return motion.position.new_full((motion.batch,), math.nan)
+    return _median(torch.stack(values, -1).flatten(2), torch.stack(masks, -1).flatten(2))
+
+
+def friction(motion: Trajectory) -> Tensor:
+    """The median force sideways over that along the normal, of bodies that slide on a floor [B]."""
+    if not any(wall.normal is not None for wall in motion.system.walls):
+        return motion.position.new_full((motion.batch,), math.nan)
+    alone, along, sideways, normal = floor_forces(motion)
+    arm = -normal * motion.size[:-1, ..., None]
+    slip = motion.velocity[:-1] + torch.linalg.cross(motion.spin[:-1], arm)
+    slip = slip - (slip * normal).sum(-1, keepdim=True) * normal
+    later = motion.velocity[1:] + torch.linalg.cross(motion.spin[1:], arm)
+    later = later - (later * normal).sum(-1, keepdim=True) * normal
+    slides = (slip.norm(dim=-1) > SLIDES) & (later.norm(dim=-1) > SLIDES) & (along > 0.5 * motion.gravity.norm())
+    resting = (motion.velocity * 1.0).diff(dim=0).mul(normal).sum(-1).abs() < 0.2 * motion.gravity.norm() * motion.dt_s
+    return _median(sideways.norm(dim=-1) / along.clamp_min(1e-9), alone & slides & resting)
+
+
+CONSTANTS: Mapping[str, PhysicalConstant] = {
+    "gravity": PhysicalConstant("gravity", "m/s2", gravity),
+    "restitution": PhysicalConstant("restitution", "", restitution),
+    "friction": PhysicalConstant("friction", "", friction),
+}
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """The mean of values [T, B, N] where the mask is set [B], NaN where it is nowhere."""
+    return torch.where(mask, values, math.nan).transpose(0, 1).flatten(1).nanmean(1)
+
+
+def _median(values: Tensor, mask: Tensor) -> Tensor:
+    return torch.where(mask, values, math.nan).transpose(0, 1).flatten(1).nanmedian(1).values

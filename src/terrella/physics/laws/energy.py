@@ -1,0 +1,72 @@
+"""Mechanical energy does not rise where nothing does work; in a system without friction it is constant."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..system import PhysicalSystem
+from ..trajectory import Trajectory
+from .law import SINGLE, occasions
+
+
+def energy(motion: Trajectory) -> Tensor:
+    """Kinetic and potential energy of the bodies that nothing drives [T + 1, B], J."""
+    moving = motion.present & ~motion.driven
+    kinetic = 0.5 * motion.mass * motion.velocity.square().sum(-1)
+    turning = 0.5 * (motion.inertia * motion.spin.square()).sum(-1)
+    potential = -motion.mass * (motion.position @ motion.gravity)
+    return ((kinetic + turning + potential) * moving).sum(-1)
+
+
+def energy_scale(motion: Trajectory) -> Tensor:
+    """The largest kinetic energy so far, and the lift of all bodies by their own size [T + 1, B], J."""
+    moving = motion.present & ~motion.driven
+    kinetic = 0.5 * (motion.mass * motion.velocity.square().sum(-1) * moving).sum(-1)
+    lift = (motion.mass * motion.size * moving).sum(-1) * motion.gravity.norm()
+    return (kinetic.cummax(0).values + lift).clamp_min(1e-9)
+
+
+class Energy:
+    """The energy above the lowest since something last did work; without dissipation, its distance to the first one."""
+
+    name, unit = "energy", "share of the kinetic energy"
+
+    def missing(self, system: PhysicalSystem) -> str:
+        free = [body for body in system.bodies if not body.driven]
+        if not free:
+            return "needs a body that nothing drives"
+        if system.hidden:
+            return f"needs the positions of {', '.join(system.hidden)}, which may do work"
+        return ""
+
+    def residual(self, motion: Trajectory) -> Tensor:
+        whole, scale, alone = energy(motion), energy_scale(motion), motion.left_alone
+        base, excess = whole[0], []
+        for step in range(motion.steps):
+            base = torch.where(alone[step], base, whole[step + 1])
+            above = whole[step + 1] - base
+            excess.append((above if motion.system.dissipates else above.abs()) / scale[step + 1])
+            base = torch.minimum(base, whole[step + 1]) if motion.system.dissipates else base
+        return torch.stack(excess).clamp_min(0) if excess else whole[1:]
+
+    def floor(self, motion: Trajectory) -> float:
+        return 10 * SINGLE
+
+    def ceiling(self, motion: Trajectory) -> float:
+        return 0.5
+
+    def violate(self, motion: Trajectory, size: float, seeds: Tensor) -> tuple[Trajectory, Tensor]:
+        """Scales the speeds of one instant, so that the energy is `size` above that of the instant before."""
+        kinetic = 0.5 * (motion.mass * motion.velocity.square().sum(-1) * ~motion.driven).sum(-1)
+        step, _, some = occasions((motion.left_alone & (kinetic[1:] > 1e-9))[..., None], seeds)
+        rows = torch.arange(motion.batch)
+        whole, scale = energy(motion), energy_scale(motion)
+        goal = whole[step, rows] + size * scale[step + 1, rows] - whole[step + 1, rows] + kinetic[step + 1, rows]
+        goal = torch.maximum(goal, goal / (1 - min(size, 0.9)))  # the scale grows with the speed
+        factor = (goal.clamp_min(0) / kinetic[step + 1, rows].clamp_min(1e-12)).sqrt()
+        velocity = motion.velocity.clone()
+        free = ~motion.driven
+        for row in some.nonzero()[:, 0].tolist():
+            velocity[step[row] + 1, row, free] *= factor[row]
+        return replace(motion, velocity=velocity), some

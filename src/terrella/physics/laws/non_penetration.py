@@ -1,0 +1,64 @@
+"""Bodies do not overlap, neither each other nor walls."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ..gaps import rotated
+from ..system import PhysicalSystem
+from ..trajectory import Trajectory
+from .law import SINGLE, largest, occasions, shifted
+
+APPROACHES = 8  # of an injected overlap to its depth
+
+
+class NonPenetration:
+    """The depth of the deepest overlap at the end of each step."""
+
+    name, unit = "non-penetration", "m"
+
+    def missing(self, system: PhysicalSystem) -> str:
+        alone = len(system.bodies) < 2 and not system.walls
+        return "needs a wall or a second body" if alone else ""
+
+    def residual(self, motion: Trajectory) -> Tensor:
+        here = motion.present[1:]
+        walls = largest((-motion.wall_gaps[1:]).clamp_min(0), here[..., None].expand_as(motion.wall_gaps[1:]))
+        gaps = -motion.body_gaps[1:]
+        return torch.maximum(walls, largest(gaps.clamp_min(0), gaps > 0))
+
+    def floor(self, motion: Trajectory) -> float:
+        return SINGLE * float(motion.position.abs().max().clamp_min(1.0))
+
+    def ceiling(self, motion: Trajectory) -> float:
+        return 0.5 * float(motion.size.amin())
+
+    def violate(self, motion: Trajectory, size: float, seeds: Tensor) -> tuple[Trajectory, Tensor]:
+        step, body, some = occasions(motion.both_present, seeds)
+        rows = torch.arange(motion.batch)
+        at = motion.position[step + 1, rows, body]
+        gaps = torch.cat([motion.wall_gaps[step + 1, rows, body], motion.body_gaps[step + 1, rows, body]], 1)
+        nearest, which = gaps.min(1)
+        some = some & nearest.isfinite()
+        goals = torch.stack([self._goal(motion, int(step[row]) + 1, row, at[row], int(which[row])) for row in rows])
+        way = (goals - at) / (goals - at).norm(dim=1, keepdim=True).clamp_min(1e-9)
+        by = torch.zeros_like(way)
+        for _ in range(APPROACHES):  # the gap is at most the distance
+            moving = replace(motion.instants(step + 1), position=(motion.position[step + 1, rows]).clone()[None])
+            moving.position[0, rows, body] += by
+            depth = torch.cat([moving.wall_gaps[0, rows, body], moving.body_gaps[0, rows, body]], 1)
+            by = by + way * (depth[rows, which] + size).clamp_min(0)[:, None]
+        return replace(motion, position=shifted(motion.position, step, body, by, some)), some
+
+    def _goal(self, motion: Trajectory, instant: int, row: int, at: Tensor, number: int) -> Tensor:
+        """The point to which a body is pushed: behind a wall, or another body's centre."""
+        walls = motion.system.walls
+        if number >= len(walls):
+            return motion.position[instant, row, number - len(walls)]
+        wall = walls[number]
+        if wall.normal is not None:
+            return at - at.new_tensor(wall.normal)
+        turn, half = rotated(at.new_tensor(wall.rotation)), at.new_tensor(wall.half_m)
+        local = turn.T @ (at - at.new_tensor(wall.centre_m))
+        return at.new_tensor(wall.centre_m) + turn @ torch.minimum(torch.maximum(local, -half), half)

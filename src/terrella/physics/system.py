@@ -1,0 +1,145 @@
+"""PhysicalSystem: which bodies, walls and limits a world has, and which numbers of its channels hold them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import TerrellaError
+
+EARTH = (0.0, 0.0, -9.81)
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+CARD = "system"  # of a Spec's card, and of the facts of a recording
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Numbers of a channel, from number `first` of its flattened values on."""
+
+    channel: str
+    first: int = 0
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A box with rounded edges: half extents 0 make a sphere, a radius of 0 a box."""
+
+    name: str
+    position: Slot  # centre of mass, one number for each of the system's axes, m
+    velocity: Slot | None = None  # one number for each axis, m/s
+    rotation: Slot | None = None  # quaternion w, x, y, z
+    spin: Slot | None = (
+        None  # angular velocity in the body's frame, one number for each of the system's spin axes, rad/s
+    )
+    present: Slot | None = None  # one number, 0 where the body is not there; None: it is always there
+    radius_m: float | Slot = 0.0  # of the rounding
+    half_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mass_kg: float = 1.0
+    density_kg_m3: float | None = None  # of a sphere whose radius is a Slot; replaces the mass
+    inertia_kg_m2: tuple[float, float, float] | None = None  # principal moments; default: a solid sphere's
+    driven: bool = False  # an actuator, a player or a program moves it
+    friction: float | None = None  # coefficient against walls, where it is known
+    max_speed_m_s: float | None = None
+
+    @property
+    def channels(self) -> set[str]:
+        slots = (self.position, self.velocity, self.rotation, self.spin, self.present, self.radius_m)
+        return {slot.channel for slot in slots if isinstance(slot, Slot)}
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A fixed box, or with `normal` a half-space that bodies stay in front of."""
+
+    centre_m: tuple[float, float, float]
+    half_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, float, float, float] = UPRIGHT
+    normal: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Rod:
+    """Keeps a body's centre at a distance from a fixed point."""
+
+    body: str
+    pivot_m: tuple[float, float, float]
+    length_m: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The range of one number of a channel: a joint, a speed, a torque."""
+
+    name: str
+    slot: Slot
+    low: float
+    high: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class PhysicalSystem:
+    """The bodies of a world. `axes`: the axes of space (x, y, z up) that a position has."""
+
+    bodies: tuple[RigidBody, ...]
+    walls: tuple[Wall, ...] = ()
+    rods: tuple[Rod, ...] = ()
+    limits: tuple[Limit, ...] = ()
+    gravity_m_s2: tuple[float, float, float] = EARTH
+    axes: tuple[int, ...] = (0, 1, 2)
+    spin_axes: tuple[int, ...] = (0, 1, 2)
+    dissipates: bool = True  # False: mechanical energy is constant
+    bounds_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    """The box (low corner, high corner) that bodies never leave."""
+    hidden: tuple[str, ...] = ()  # moving parts that touch bodies and that no channel holds
+
+    def __post_init__(self):
+        names = [body.name for body in self.bodies]
+        if not names or len(set(names)) < len(names):
+            raise TerrellaError("a physical system has one body or more, each with a name of its own.")
+        if strangers := sorted({rod.body for rod in self.rods} - set(names)):
+            raise TerrellaError(f"a rod holds {', '.join(strangers)}, which is no body; there are {', '.join(names)}.")
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels that hold the system."""
+        names = {name for body in self.bodies for name in body.channels} | {one.slot.channel for one in self.limits}
+        return tuple(sorted(names))
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON values."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(facts: Mapping[str, Any]) -> PhysicalSystem:
+        """The inverse of `to_json`; TerrellaError for other facts."""
+        kinds: dict[str, Any] = {"bodies": RigidBody, "walls": Wall, "rods": Rod, "limits": Limit}
+        try:
+            plain = {name: _tuples(value) for name, value in facts.items() if name not in kinds}
+            parts = {name: tuple(_made(kind, one) for one in facts.get(name, ())) for name, kind in kinds.items()}
+            return PhysicalSystem(**parts, **plain)
+        except (TypeError, ValueError, AttributeError, KeyError) as error:
+            raise TerrellaError(f"this is no physical system ({error}); docs/physics.md shows one.") from error
+
+    @staticmethod
+    def read(file: str | Path) -> PhysicalSystem:
+        """The system in a JSON file; TerrellaError where it cannot be read."""
+        try:
+            return PhysicalSystem.from_json(json.loads(Path(file).read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise TerrellaError(f"{file} is no JSON file of a physical system ({error}).") from error
+
+
+def _made(kind: Any, facts: Mapping[str, Any]) -> Any:
+    known = {part.name for part in fields(kind)}
+    if unknown := sorted(set(facts) - known):
+        raise ValueError(f"a {kind.__name__} has no {', '.join(unknown)}")
+    slots = {name: Slot(**value) for name, value in facts.items() if isinstance(value, Mapping)}
+    return kind(**{name: slots[name] if name in slots else _tuples(value) for name, value in facts.items()})
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
