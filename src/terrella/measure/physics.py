@@ -109,9 +109,9 @@ def examine_physics(
         spread = ratio_interval(deviations[1], deviations[0].clamp_min(1e-7), rng)
     travelled = [part.position.diff(dim=0).norm(dim=-1).sum(-1).mean(0) for part in (truth, dream)]
     change = ratio_interval(travelled[1], travelled[0], rng) if float(travelled[0].sum()) > 0 else None
-    horizons = (median_interval(one.horizon.double(), rng) for one in (strict, loose))
+    horizon, wide_horizon = (median_interval(one.horizon.double(), rng) for one in (strict, loose))
     return PhysicsReport(
-        name, dream.batch, dream.steps, dream.dt_s, laws, missing, constants, spread, deviation, *horizons, change,
+        name, dream.batch, dream.steps, dream.dt_s, laws, missing, constants, spread, deviation, horizon, wide_horizon, change,
         _worst(loose, truth, dream),
     )  # fmt: skip
 

@@ -169,7 +169,8 @@ def trajectory_of(system: PhysicalSystem, observations: Mapping[str, Tensor], dt
     flat = {name: observations[name].detach().cpu().double().flatten(2) if observations[name].ndim > 2
             else observations[name].detach().cpu().double()[..., None] for name in system.channels}  # fmt: skip
     each = [_body(system, body, flat, dt_s) for body in system.bodies]
-    return Trajectory(system, dt_s, *(torch.stack(part, 2) for part in zip(*each)), flat)
+    position, velocity, rotation, spin, present, radius = (torch.stack(part, 2) for part in zip(*each))
+    return Trajectory(system, dt_s, position, velocity, rotation, spin, present, radius, flat)
 
 
 def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], dt_s: float) -> tuple[Tensor, ...]:
@@ -212,3 +213,22 @@ def _spread(values: Tensor, axes: tuple[int, ...]) -> Tensor:
     whole = values.new_zeros(*values.shape[:-1], 3)
     whole[..., list(axes)] = values
     return whole
+
+
+def channels_of(motion: Trajectory) -> dict[str, Tensor]:
+    """The channels of the last instant [B, K], with the bodies of the motion written into them: the inverse of `trajectory_of`."""
+    flat = {name: part[-1].clone() for name, part in motion.channels.items()}
+    axes, spin_axes = list(motion.system.axes), list(motion.system.spin_axes)
+    for at, body in enumerate(motion.system.bodies):
+        parts = [(body.position, motion.position[-1, :, at][:, axes])]
+        parts += [(body.velocity, motion.velocity[-1, :, at][:, axes])] if body.velocity else []
+        parts += [(body.rotation, motion.rotation[-1, :, at])] if body.rotation else []
+        parts += [(body.spin, motion.spin[-1, :, at][:, spin_axes])] if body.spin else []
+        if body.present is not None:
+            held = flat[body.present.channel][:, body.present.first]
+            here = motion.present[-1, :, at]
+            was = motion.channels[body.present.channel][-2, :, body.present.first] if motion.steps else held
+            parts.append((body.present, torch.where(here, torch.where(held != 0, held, was), 0.0)[:, None]))
+        for slot, values in parts:
+            flat[slot.channel][:, slot.first : slot.first + values.shape[1]] = values
+    return flat

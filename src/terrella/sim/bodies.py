@@ -27,7 +27,7 @@ _DENSITY = 1000.0  # kg/m3
 _FLOOR, _SKY, _COLOURS = (70, 78, 92), (16, 20, 27), ((111, 211, 193), (227, 168, 87), (142, 166, 255))
 _STREAM = 11
 
-Ranges = Mapping[str, tuple[tuple[float, float], tuple[float, float]]]  # name -> (low, high) in and out of training
+Ranges = Mapping[str, tuple[tuple[float, float], ...]]  # name -> (low, high) in and out of training
 Values = Mapping[str, Tensor]  # position [B, N, 2], velocity [B, N, 2], radius [B, N], spin [B, N]
 
 

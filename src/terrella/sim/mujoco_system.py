@@ -47,7 +47,7 @@ def system_of(model: mujoco.MjModel) -> PhysicalSystem | None:
     if not bodies:
         return None
     return PhysicalSystem(
-        tuple(bodies), tuple(walls), (), tuple(limits), tuple(map(float, model.opt.gravity)), hidden=tuple(hidden)
+        tuple(bodies), tuple(walls), (), tuple(limits), _triple(model.opt.gravity), hidden=tuple(hidden)
     )  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def _shape(model: mujoco.MjModel, geom: int) -> dict[str, Any] | None:
     if model.geom_type[geom] == int(_SPHERE) and centred:
         return {"radius_m": float(model.geom_size[geom][0])}
     if model.geom_type[geom] == int(_BOX) and centred:
-        return {"half_m": tuple(map(float, model.geom_size[geom]))}
+        return {"half_m": _triple(model.geom_size[geom])}
     return None
 
 
@@ -66,7 +66,7 @@ def _free_body(model: mujoco.MjModel, at: int, name: str, geom: int, shape: dict
     friction = max(float(model.geom_friction[one][0]) for one in range(model.ngeom))
     return RigidBody(
         name, Slot("qpos", qpos), Slot("qvel", qvel), Slot("qpos", qpos + 3), Slot("qvel", qvel + 3), **shape,
-        mass_kg=float(model.body_mass[at]), inertia_kg_m2=tuple(map(float, model.body_inertia[at])), friction=friction,
+        mass_kg=float(model.body_mass[at]), inertia_kg_m2=_triple(model.body_inertia[at]), friction=friction,
     )  # fmt: skip
 
 
@@ -76,13 +76,13 @@ def _wall(model: mujoco.MjModel, geom: int) -> Wall | None:
     mujoco.mju_mulQuat(turn, model.body_quat[body], model.geom_quat[geom])
     mujoco.mju_rotVecQuat(centre, model.geom_pos[geom], model.body_quat[body])
     centre += model.body_pos[body]
-    place = tuple(map(float, centre))
+    place = _triple(centre)
     if model.geom_type[geom] == int(_PLANE):
         normal = np.zeros(3)
         mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), turn)
-        return Wall(place, normal=tuple(map(float, normal)))
+        return Wall(place, normal=_triple(normal))
     if model.geom_type[geom] == int(_BOX):
-        return Wall(place, tuple(map(float, model.geom_size[geom])), tuple(map(float, turn)))
+        return Wall(place, _triple(model.geom_size[geom]), _quadruple(turn))
     return None
 
 
@@ -114,3 +114,13 @@ def _limits(model: mujoco.MjModel) -> list[Limit]:
                 Limit(model.joint(at).name or f"joint {at}", Slot("qpos", int(model.jnt_qposadr[at])), low, high, unit)
             )
     return limits
+
+
+def _triple(values: Any) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _quadruple(values: Any) -> tuple[float, float, float, float]:
+    w, x, y, z = map(float, values)
+    return w, x, y, z

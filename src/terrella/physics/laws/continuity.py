@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, random_directions, shifted
+from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
 class Continuity:
@@ -57,3 +57,15 @@ class Continuity:
         return replace(
             motion, position=shifted(motion.position, step, body, ahead * (slack + size)[:, None], some)
         ), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """In flight, the displacement of the mean velocity; in contact, a displacement that the speed allows."""
+        way, dt_s = motion.position[-1] - motion.position[-2], motion.dt_s
+        mean = 0.5 * (motion.velocity[-1] + motion.velocity[-2]) * dt_s
+        reach = dt_s * torch.maximum(motion.velocity[-1].norm(dim=-1), motion.velocity[-2].norm(dim=-1))
+        fastest = motion.position.new_tensor([body.max_speed_m_s or 0.0 for body in motion.system.bodies])
+        measured = torch.tensor([body.velocity is not None for body in motion.system.bodies])
+        reach = torch.where(measured, reach, torch.where(fastest > 0, fastest * dt_s, way.norm(dim=-1)))
+        short = way * (reach / way.norm(dim=-1).clamp_min(1e-12)).clamp_max(1)[..., None]
+        smooth = (motion.clear[-1] & measured)[..., None]
+        return with_last(motion, position=motion.position[-2] + torch.where(smooth, mean, short))

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, occasions
+from .law import SINGLE, occasions, with_last
 
 
 def energy(motion: Trajectory) -> Tensor:
@@ -70,3 +70,15 @@ class Energy:
         for row in some.nonzero()[:, 0].tolist():
             velocity[step[row] + 1, row, free] *= factor[row]
         return replace(motion, velocity=velocity), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """Scales the speeds, so that the energy is that before the step; where heights alone exceed it, bodies stop."""
+        whole, free = energy(motion), (~motion.driven)[None, :, None]
+        kinetic = (0.5 * motion.mass[-1] * motion.velocity[-1].square().sum(-1) * ~motion.driven).sum(-1)
+        excess = whole[-1] - (whole[:-1].amin(0) if motion.system.dissipates else whole[-2])
+        wrong = (excess > 0) | (not motion.system.dissipates)
+        factor = ((kinetic - excess).clamp_min(0) / kinetic.clamp_min(1e-12)).sqrt()
+        factor = torch.where(wrong & motion.left_alone[-1] & (kinetic > 1e-9), factor, 1.0)
+        return with_last(
+            motion, velocity=torch.where(free, motion.velocity[-1] * factor[:, None, None], motion.velocity[-1])
+        )

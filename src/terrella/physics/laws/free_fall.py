@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, random_directions, shifted
+from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
 def ballistic(motion: Trajectory) -> Tensor:
@@ -44,3 +44,12 @@ class FreeFall:
         step, body, some = occasions(ballistic(motion), seeds)
         by = random_directions(motion, seeds) * size * motion.dt_s
         return replace(motion, velocity=shifted(motion.velocity, step, body, by, some)), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """Flight from the instant before."""
+        flies, dt_s, pull = ballistic(motion)[-1][..., None], motion.dt_s, motion.gravity
+        before, speed = motion.position[-2], motion.velocity[-2]
+        position = torch.where(flies, before + speed * dt_s + 0.5 * pull * dt_s**2, motion.position[-1])
+        return with_last(
+            motion, position=position, velocity=torch.where(flies, speed + pull * dt_s, motion.velocity[-1])
+        )

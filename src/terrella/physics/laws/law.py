@@ -1,5 +1,6 @@
 """Law: what every law has, and how a violation of a known size is injected to measure its power."""
 
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -38,6 +39,17 @@ class Law(Protocol):
         """The motion with one violation of `size`, in `unit`, in each rollout, and bool [B]: the rollouts that had an occasion.
         seeds int64 [B]."""
         ...
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """The motion with its last instant projected onto the states that keep the law."""
+        ...
+
+
+def with_last(motion: Trajectory, **parts: Tensor) -> Trajectory:
+    """The motion with other tensors at its last instant: name -> [B, N, ...]."""
+    return replace(
+        motion, **{name: torch.cat([getattr(motion, name)[:-1], part[None]]) for name, part in parts.items()}
+    )
 
 
 def largest(values: Tensor, mask: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, random_directions, shifted
+from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
 class Limits:
@@ -62,3 +62,20 @@ class Limits:
         wanted = random_directions(motion, seeds) * float(fastest.min()) * (1 + size)
         by = wanted - motion.velocity[step + 1, rows, at]
         return replace(motion, velocity=shifted(motion.velocity, step, at, by, every)), every
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """Clips numbers and speeds to their range, and puts bodies back on their rods, without speed along them."""
+        position, velocity = motion.position[-1].clone(), motion.velocity[-1].clone()
+        names = [body.name for body in motion.system.bodies]
+        for rod in motion.system.rods:
+            at, pivot = names.index(rod.body), motion.position.new_tensor(rod.pivot_m)
+            arm = position[:, at] - pivot
+            along = arm / arm.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            position[:, at] = pivot + rod.length_m * along
+            velocity[:, at] -= (velocity[:, at] * along).sum(-1, keepdim=True) * along
+        speed = velocity.norm(dim=-1)
+        velocity = velocity * (self._fastest(motion) / speed.clamp_min(1e-12)).clamp_max(1)[..., None]
+        channels = {name: part.clone() for name, part in motion.channels.items()}
+        for one in motion.system.limits:
+            channels[one.slot.channel][-1, :, one.slot.first].clamp_(one.low, one.high)
+        return replace(with_last(motion, position=position, velocity=velocity), channels=channels)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, random_directions, shifted
+from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
 def closed_groups(motion: Trajectory) -> tuple[Tensor, Tensor]:
@@ -53,3 +53,14 @@ class Momentum:
         share = (group[step, rows, body] * mass).sum(1) / mass[rows, body]
         by = random_directions(motion, seeds) * (size * share)[:, None]
         return replace(motion, velocity=shifted(motion.velocity, step, body, by, some)), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """The group's excess is taken from the velocity of each of its bodies."""
+        group, closed = (part[-1] for part in closed_groups(motion))
+        mass = motion.mass[-1]
+        impulse = mass[..., None] * (motion.velocity[-1] - motion.velocity[-2] - motion.gravity * motion.dt_s)
+        excess = torch.einsum("bij,bjk->bik", group.double(), impulse)
+        excess = excess / torch.einsum("bij,bj->bi", group.double(), mass).clamp_min(1e-12)[..., None]
+        return with_last(
+            motion, velocity=torch.where(closed[..., None], motion.velocity[-1] - excess, motion.velocity[-1])
+        )

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ..gaps import rotated
-from ..system import PhysicalSystem
+from ..system import PhysicalSystem, Wall
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, shifted
+from .law import SINGLE, largest, occasions, shifted, with_last
 
+PUSHES = 3  # of a correction
 APPROACHES = 8  # of an injected overlap to its depth
 
 
@@ -41,7 +42,9 @@ class NonPenetration:
         gaps = torch.cat([motion.wall_gaps[step + 1, rows, body], motion.body_gaps[step + 1, rows, body]], 1)
         nearest, which = gaps.min(1)
         some = some & nearest.isfinite()
-        goals = torch.stack([self._goal(motion, int(step[row]) + 1, row, at[row], int(which[row])) for row in rows])
+        goals = torch.stack(
+            [self._goal(motion, int(step[row]) + 1, row, at[row], int(which[row])) for row in range(motion.batch)]
+        )
         way = (goals - at) / (goals - at).norm(dim=1, keepdim=True).clamp_min(1e-9)
         by = torch.zeros_like(way)
         for _ in range(APPROACHES):  # the gap is at most the distance
@@ -62,3 +65,31 @@ class NonPenetration:
         turn, half = rotated(at.new_tensor(wall.rotation)), at.new_tensor(wall.half_m)
         local = turn.T @ (at - at.new_tensor(wall.centre_m))
         return at.new_tensor(wall.centre_m) + turn @ torch.minimum(torch.maximum(local, -half), half)
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """Pushes bodies out of walls and of each other, the lighter ones more; bodies that something drives stay."""
+        for _ in range(PUSHES):
+            position, last = motion.position[-1].clone(), motion.instants(torch.full((motion.batch,), motion.steps))
+            for number, wall in enumerate(motion.system.walls):
+                depth = (-last.wall_gaps[0, ..., number]).clamp_min(0)
+                if (depth > 0).any():
+                    position = position + depth[..., None] * self._out_of(wall, position)
+            mass = torch.where(motion.driven, 1e9, motion.mass[-1])
+            overlap = (-last.body_gaps[0]).clamp_min(0)
+            apart = position[:, :, None] - position[:, None, :]
+            away = apart / apart.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+            share = mass[:, None, :] / (mass[:, None, :] + mass[:, :, None])
+            position = position + (overlap * share)[..., None].mul(away).sum(2)
+            motion = with_last(motion, position=position)
+        return motion
+
+    def _out_of(self, wall: Wall, position: Tensor) -> Tensor:
+        """Unit vectors [B, N, 3] away from a wall."""
+        if wall.normal is not None:
+            return position.new_tensor(wall.normal).expand_as(position)
+        turn, half = rotated(position.new_tensor(wall.rotation)), position.new_tensor(wall.half_m)
+        local = (position - position.new_tensor(wall.centre_m)) @ turn
+        outside = local - torch.minimum(torch.maximum(local, -half), half)
+        face = torch.nn.functional.one_hot((half - local.abs()).argmin(-1), 3) * torch.where(local < 0, -1.0, 1.0)
+        inside = outside.norm(dim=-1, keepdim=True) < 1e-9
+        return torch.where(inside, face.double(), outside / outside.norm(dim=-1, keepdim=True).clamp_min(1e-9)) @ turn.T

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import occasions
+from .law import occasions, with_last
 
+_PLACE = ("position", "velocity", "rotation", "spin")
 MERGED = 0.1  # of the sum of two sizes: nearer centres are one body
 
 
@@ -46,3 +47,14 @@ class Permanence:
         instants = torch.arange(motion.steps + 1)[:, None] > step[None, :]
         gone = (instants & some)[..., None] & (torch.arange(motion.present.shape[2]) == body[:, None])[None]
         return replace(motion, present=motion.present & ~gone), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """Bodies that vanished or left the bounds are where they were; new ones go."""
+        was, lost = motion.present[-2], motion.present[-2] & ~motion.present[-1]
+        if motion.system.bounds_m is not None:
+            low, high = motion.position.new_tensor(motion.system.bounds_m)
+            lost = lost | (motion.position[-1] < low).any(-1) | (motion.position[-1] > high).any(-1)
+        parts = {
+            name: torch.where(lost[..., None], getattr(motion, name)[-2], getattr(motion, name)[-1]) for name in _PLACE
+        }
+        return with_last(motion, present=was, **parts)

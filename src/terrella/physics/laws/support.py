@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..system import PhysicalSystem
 from ..trajectory import Trajectory
-from .law import SINGLE, largest, occasions, shifted
+from .law import SINGLE, largest, occasions, shifted, with_last
 
 
 def floor_forces(motion: Trajectory) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -61,3 +61,12 @@ class Support:
         rows = torch.arange(motion.batch)
         by = -(along[step, rows, body] + size)[:, None] * normal[step, rows, body] * motion.dt_s
         return replace(motion, velocity=shifted(motion.velocity, step, body, by, some)), some
+
+    def correct(self, motion: Trajectory) -> Trajectory:
+        """The force is projected onto the friction cone."""
+        alone, along, sideways, normal = (part[-1] for part in floor_forces(motion))
+        push = along.clamp_min(0)
+        share = (self._cone(motion) * push / sideways.norm(dim=-1).clamp_min(1e-12)).clamp_max(1)
+        force = push[..., None] * normal + share[..., None] * sideways
+        velocity = motion.velocity[-2] + (force + motion.gravity) * motion.dt_s
+        return with_last(motion, velocity=torch.where(alone[..., None], velocity, motion.velocity[-1]))
