@@ -1,6 +1,7 @@
 """Laws that a rollout must obey, with tolerances that are calibrated on the truth."""
 
 from .certificates import Certificates, certify
+from .guarded import GuardConfig, Guarded, GuardReport, replay_case
 from .laws import LAWS, Law
 from .system import PhysicalSystem, RigidBody, Rod, Slot, Wall
 from .tolerance import Tolerance, calibrate
@@ -18,4 +19,4 @@ __all__ = [
     "Tolerance",
     "Wall",
 ]
-__all__ += ["calibrate", "certify", "trajectory_of"]
+__all__ += ["GuardConfig", "GuardReport", "Guarded", "replay_case", "calibrate", "certify", "trajectory_of"]

@@ -42,6 +42,7 @@ class RigidBody:
     inertia_kg_m2: tuple[float, float, float] | None = None  # principal moments; default: a solid sphere's
     driven: bool = False  # an actuator, a player or a program moves it
     friction: float | None = None  # coefficient against walls, where it is known
+    restitution: float | None = None  # speed after a bounce from a plane over that before, where it is known
     max_speed_m_s: float | None = None
 
     @property

@@ -45,6 +45,7 @@ class BodiesFamily:
     rods: tuple[Rod, ...] = ()
     dissipates: bool = False
     friction: float | None = None
+    restitution: float | None = None
     spins: bool = False
     view: tuple[float, float, float] = (-2.0, -2.0, 4.0)  # x and z of the picture's corner, and its width, m
     facts: Mapping[str, float] = field(default_factory=dict)  # constants of the truth
@@ -56,7 +57,7 @@ class BodiesFamily:
             RigidBody(
                 f"ball {at + 1}", Slot("position", 2 * at), Slot("velocity", 2 * at),
                 spin=Slot("spin", at) if self.spins else None, radius_m=Slot("radius", at), density_kg_m3=_DENSITY,
-                friction=self.friction,
+                friction=self.friction, restitution=self.restitution,
             )
             for at in range(self.bodies)
         )  # fmt: skip
@@ -120,7 +121,7 @@ FAMILIES: Mapping[str, BodiesFamily] = {
         "a ball that bounces between walls", _fly, lambda now, dt_s: advance_bounce(now, dt_s, RESTITUTION),
         {"x": _SAME, "z": ((0.6, 1.2), (1.6, 2.4)), "speed": ((0.0, 1.0), (1.5, 2.5)), "angle": ((-3.14, 3.14),) * 2,
          "radius": ((0.08, 0.16), (0.2, 0.28))},
-        walls=(_GROUND, *_SIDES), dissipates=True, friction=0.0, view=(-1.2, -0.2, 2.4),
+        walls=(_GROUND, *_SIDES), dissipates=True, friction=0.0, restitution=RESTITUTION, view=(-1.2, -0.2, 2.4),
         facts={"gravity_m_s2": GRAVITY, "restitution": RESTITUTION},
     ),
     "pendulum": BodiesFamily(

@@ -1,0 +1,175 @@
+"""Guarded: a World that detects, corrects, counts and dumps; a correction that freezes motion is caught."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from terrella.core import State, check_world, make_rng, rollout
+from terrella.core.errors import TerrellaError
+from terrella.physics import PhysicalSystem, calibrate, trajectory_of
+from terrella.physics.guarded import GuardConfig, Guarded, replay_case
+from terrella.sim.bodies import BodiesConfig, BodiesWorld
+
+STEPS = 24
+
+
+class Biased:
+    """A family whose predictions are off: gravity is halved, and bodies stick in the floor."""
+
+    def __init__(self, family: str, noise: float = 0.0):
+        self.world, self.noise = BodiesWorld(family, BodiesConfig(pictures=False)), noise
+        self.spec = replace(self.world.spec, name=f"{family} biased")
+
+    def start(self, batch, rng):
+        return self.world.start(batch, rng)
+
+    def observe(self, observation, prior, rng):
+        return self.world.observe(observation, prior, rng)
+
+    def imagine(self, state: State, action, rng) -> State:
+        after = self.world.imagine(state, action, rng)
+        lift = torch.tensor([0.0, 0.5 * 9.81 * self.spec.dt_s]).double() * bool(self.world.family.gravity[2])
+        velocity = after["velocity"] + lift
+        if self.noise:
+            velocity = velocity + self.noise * torch.randn(velocity.shape, generator=rng)
+        return after.replace(velocity=velocity)
+
+    def render(self, state, channels):
+        return self.world.render(state, channels)
+
+
+def truth(family: str, seed: int, batch: int):
+    world = BodiesWorld(family, BodiesConfig(pictures=False))
+    system = PhysicalSystem.from_json(world.spec.system)
+    waits = torch.zeros(STEPS, batch, dtype=torch.long)
+    seen = rollout(world, world.start(batch, make_rng(seed)), waits, make_rng(0), system.channels).observations
+    return system, seen, trajectory_of(system, seen, world.spec.dt_s)
+
+
+def predicted(world, seen, batch: int, system):
+    state = world.observe({name: seen[name][0] for name in world.spec.observes}, None, make_rng(0))
+    done = rollout(world, state, torch.zeros(STEPS, batch, dtype=torch.long), make_rng(0), system.channels)
+    return done.final, trajectory_of(system, done.observations, world.spec.dt_s)
+
+
+@pytest.mark.parametrize("family", ["parabola", "bouncing"])
+def test_a_guard_removes_most_violations_and_most_of_the_error(family):
+    system, _, known = truth(family, 1, 120)
+    _, seen, true = truth(family, 2, 20)
+    tolerances, bare = calibrate(known), Biased(family)
+    guarded = Guarded(bare, system, tolerances)
+    (final, mine), (_, plain) = predicted(guarded, seen, 20, system), predicted(bare, seen, 20, system)
+    report = guarded.report(final)
+    assert report.steps == 20 * STEPS
+    assert report.broken["free fall"] > 0.5
+    assert sum(report.left.values()) < 0.1 * sum(report.broken.values())
+    errors = [float((one.position[-1] - true.position[-1]).norm(dim=-1).mean()) for one in (mine, plain)]
+    assert errors[0] < 0.2 * errors[1]
+    assert not report.frozen and report.asked == 0
+
+
+def test_the_truth_is_left_as_it_is():
+    system, _, known = truth("collision", 1, 120)
+    _, seen, true = truth("collision", 2, 10)
+    guarded = Guarded(BodiesWorld("collision", BodiesConfig(pictures=False)), system, calibrate(known))
+    final, mine = predicted(guarded, seen, 10, system)
+    assert guarded.report(final).corrected == 0
+    assert torch.allclose(mine.position, true.position, atol=1e-5)
+
+
+def test_a_guarded_world_keeps_the_contract():
+    system, _, known = truth("bouncing", 1, 60)
+    check_world(Guarded(Biased("bouncing"), system, calibrate(known)), steps=3)
+
+
+def test_a_simulator_takes_the_broken_steps():
+    system, _, known = truth("collision", 1, 120)
+    _, seen, true = truth("collision", 2, 10)
+    bare, sim = Biased("collision", noise=0.05), BodiesWorld("collision", BodiesConfig(pictures=False))
+    guarded = Guarded(bare, system, calibrate(known), sim)
+    final, mine = predicted(guarded, seen, 10, system)
+    assert guarded.report(final).asked > 0.9
+    assert torch.allclose(mine.position, true.position, atol=1e-3)
+
+
+def test_the_best_of_several_predictions_breaks_less():
+    system, _, known = truth("uniform", 1, 120)
+    _, seen, _ = truth("uniform", 2, 10)
+    tolerances = [replace(one, value=0.5 * one.law.ceiling(known)) for one in calibrate(known)]
+    bare = Biased("uniform", noise=0.1)
+    shares = []
+    for draws in (1, 8):
+        guarded = Guarded(bare, system, tolerances, config=GuardConfig(project=False, draws=draws))
+        report = guarded.report(predicted(guarded, seen, 10, system)[0])
+        shares.append(sum(report.broken.values()) if draws == 1 else sum(report.left.values()))
+    assert shares[1] < 0.7 * shares[0]
+
+
+def test_detecting_alone_changes_nothing():
+    system, _, known = truth("parabola", 1, 120)
+    _, seen, _ = truth("parabola", 2, 5)
+    bare = Biased("parabola")
+    guarded = Guarded(bare, system, calibrate(known), config=GuardConfig(project=False))
+    (final, mine), (_, plain) = predicted(guarded, seen, 5, system), predicted(bare, seen, 5, system)
+    assert torch.allclose(mine.position, plain.position, atol=1e-6)
+    assert guarded.report(final).broken["free fall"] > 0.9 and guarded.report(final).corrected == 0
+
+
+def test_a_correction_that_freezes_motion_is_caught():
+    class Freezing:
+        """A law whose projection puts everything back."""
+
+        def __init__(self, law):
+            self.name, self.unit, self._law = law.name, law.unit, law
+
+        def residual(self, motion):
+            return self._law.residual(motion)
+
+        def correct(self, motion):
+            still = {
+                name: torch.cat([getattr(motion, name)[:-1], getattr(motion, name)[-2:-1]])
+                for name in ("position", "velocity")
+            }
+            return replace(motion, **still)
+
+    system, _, known = truth("parabola", 1, 120)
+    _, seen, _ = truth("parabola", 2, 5)
+    fall = next(one for one in calibrate(known) if one.law.name == "free fall")
+    guarded = Guarded(Biased("parabola"), system, [replace(fall, law=Freezing(fall.law))])
+    report = guarded.report(predicted(guarded, seen, 5, system)[0])
+    assert report.frozen and "FROZEN" in str(report)
+
+
+def test_a_broken_step_is_dumped_and_can_be_replayed(tmp_path):
+    system, _, known = truth("parabola", 1, 120)
+    _, seen, _ = truth("parabola", 2, 3)
+    bare = Biased("parabola")
+    guarded = Guarded(bare, system, calibrate(known), config=GuardConfig(dumps=tmp_path))
+    predicted(guarded, seen, 3, system)
+    files = sorted(tmp_path.glob("case-*.safetensors"))
+    assert len(files) == 8
+    before, after = replay_case(bare, files[0])
+    assert torch.allclose(before["position"].flatten(1).float(), seen["position"][0], atol=1e-5)
+    assert float((after["velocity"] - before["velocity"])[..., 1].mean()) == pytest.approx(
+        -0.5 * 9.81 * 0.025, rel=1e-3
+    )
+
+
+def test_bad_guards_get_a_sentence():
+    system, _, known = truth("parabola", 1, 60)
+    tolerances = calibrate(known)
+    blind = Biased("parabola")
+    blind.spec = replace(blind.spec, observes=())
+    with pytest.raises(TerrellaError, match="cannot be set from its channels"):
+        Guarded(blind, system, tolerances)
+    slow = BodiesWorld("parabola", BodiesConfig(pictures=False))
+    slow.spec = replace(slow.spec, dt_s=0.1)
+    with pytest.raises(TerrellaError, match="steps by 0.1 s and the world by 0.025 s"):
+        Guarded(Biased("parabola"), system, tolerances, slow)
+    feet = BodiesWorld("parabola", BodiesConfig(pictures=False))
+    feet.spec = replace(feet.spec, units={"position": "ft"})
+    with pytest.raises(TerrellaError, match="is in m in the world and in ft in the simulator"):
+        Guarded(Biased("parabola"), system, tolerances, feet)
+    with pytest.raises(TerrellaError, match="needs a world that leaps"):
+        Guarded(Biased("parabola"), system, tolerances, config=GuardConfig(disagreement=0.1))
