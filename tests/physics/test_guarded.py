@@ -66,7 +66,7 @@ def test_a_guard_removes_most_violations_and_most_of_the_error(family):
     assert sum(report.left.values()) < 0.1 * sum(report.broken.values())
     errors = [float((one.position[-1] - true.position[-1]).norm(dim=-1).mean()) for one in (mine, plain)]
     assert errors[0] < 0.2 * errors[1]
-    assert not report.frozen and report.asked == 0
+    assert not report.frozen and report.simulated == 0
 
 
 def test_the_truth_is_left_as_it_is():
@@ -89,7 +89,7 @@ def test_a_simulator_takes_the_broken_steps():
     bare, sim = Biased("collision", noise=0.05), BodiesWorld("collision", BodiesConfig(pictures=False))
     guarded = Guarded(bare, system, calibrate(known), sim)
     final, mine = predicted(guarded, seen, 10, system)
-    assert guarded.report(final).asked > 0.9
+    assert guarded.report(final).simulated > 0.9
     assert torch.allclose(mine.position, true.position, atol=1e-3)
 
 

@@ -179,3 +179,18 @@ def test_gaps_of_boxes_and_spheres_are_exact():
     walls = wall_gaps(place, turned, half, radius, (FLOOR, Wall((0.0, 0.0, 2.0), (5.0, 5.0, 1.0))))[0, 0]
     assert float(walls[0, 0]) == pytest.approx(-0.3) and 0 < float(walls[0, 1]) <= 0.7  # far away a lower bound
     assert walls[1].tolist() == pytest.approx([0.35, 0.25])
+
+
+def test_a_mujoco_model_describes_its_bodies_walls_and_limits(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "nested.xml").write_text(
+        "<mujoco><worldbody><geom type='plane' size='1 1 1'/><body pos='0 0 1'><body pos='0 2 0'><geom type='box' size='1 1 1'/>"
+        "</body></body><body name='ball' pos='0 0 4'><freejoint/><geom size='0.1' mass='2'/></body>"
+        "<body name='flap'><joint name='hinge' range='-30 60' limited='true'/><geom type='capsule' size='0.1 1'/></body>"
+        "</worldbody></mujoco>"
+    )
+    system = PhysicalSystem.from_json(terrella.load(f"mujoco:{tmp_path / 'nested.xml'}", cameras=()).spec.system)
+    assert [(body.name, body.radius_m, body.mass_kg) for body in system.bodies] == [("ball", 0.1, 2.0)]
+    assert [wall.centre_m for wall in system.walls] == [(0.0, 0.0, 0.0), (0.0, 2.0, 1.0)]
+    assert system.hidden == ("flap",) and "flap" in LAWS[1].missing(system)
+    assert [(one.name, round(one.high, 3)) for one in system.limits] == [("hinge", 1.047)]

@@ -52,7 +52,7 @@ class GuardReport:
     broken: Mapping[str, float]  # law -> the share of steps that broke it as predicted
     left: Mapping[str, float]  # law -> the share of steps that break it still, after correction
     corrected: float  # share of steps
-    asked: float  # share of steps that the simulator took
+    simulated: float  # share of steps that the simulator took
     change: float  # how far bodies go, over how far the world predicted
 
     @property
@@ -64,9 +64,7 @@ class GuardReport:
         laws = "; ".join(
             f"{name} {share:.1%} of steps, {self.left[name]:.1%} after" for name, share in self.broken.items() if share
         )
-        words = (
-            f"{self.steps} steps; broken: {laws or 'none'}; corrected {self.corrected:.1%}, simulator {self.asked:.1%}"
-        )
+        words = f"{self.steps} steps; broken: {laws or 'none'}; corrected {self.corrected:.1%}, simulator {self.simulated:.1%}"
         return words + f"; bodies go {self.change:.2f} times as far" + ("; FROZEN" if self.frozen else "")
 
 
@@ -151,19 +149,26 @@ class Guarded:
             self._dump(bare.at(wrong), action[wrong])
         if self.config.draws > 1 and wrong.any():
             proposal, predicted, ratios = self._drawn_again(state, proposal, predicted, ratios, wrong, action, seeds)
-        motion, asked = predicted, torch.zeros(state.batch, dtype=torch.bool)
+        motion, by_simulator = predicted, torch.zeros(state.batch, dtype=torch.bool)
         if self.simulator is not None:
-            asked = wrong if self.config.disagreement is None else self._disagrees(bare, action) & ~_done(bare)
-            motion = self._simulated(state, motion, action, asked)
+            by_simulator = wrong if self.config.disagreement is None else self._disagrees(bare, action) & ~_done(bare)
+            motion = self._simulated(state, motion, action, by_simulator)
         if self.config.project:
-            motion = self._projected(motion, fresh, ~_done(bare) & ~asked)
+            motion = self._projected(motion, fresh, ~_done(bare) & ~by_simulator)
         left = self._ratios(motion, fresh) > 1
         flat = channels_of(motion)
         changed = torch.stack([(flat[name] != predicted.channels[name][-1]).any(1) for name in flat]).any(0)
         if changed.any():
             proposal = self._written(proposal, flat, changed, rng)
         way = torch.stack([_way(predicted), _way(motion)], 1)
-        counts = {"age": 1, "broken": broken, "left": left, "corrected": changed & ~asked, "asked": asked, "way": way}
+        counts = {
+            "age": 1,
+            "broken": broken,
+            "left": left,
+            "corrected": changed & ~by_simulator,
+            "simulated": by_simulator,
+            "way": way,
+        }
         history = {name: torch.stack([part[-2], flat[name]], 1) for name, part in motion.channels.items()}
         counted = {name: state[_GUARD + name] + value for name, value in counts.items()}
         return proposal.replace(**{_GUARD + name: part for name, part in {**history, **counted}.items()})
@@ -183,7 +188,7 @@ class Guarded:
         way = state[_GUARD + "way"].sum(0)
         return GuardReport(
             steps, dict(zip(names, shares[0])), dict(zip(names, shares[1])), float(state[_GUARD + "corrected"].sum()) / every,
-            float(state[_GUARD + "asked"].sum()) / every, float(way[1] / way[0].clamp_min(1e-12)) if float(way[0]) > 0 else 1.0,
+            float(state[_GUARD + "simulated"].sum()) / every, float(way[1] / way[0].clamp_min(1e-12)) if float(way[0]) > 0 else 1.0,
         )  # fmt: skip
 
     # -- inside -------------------------------------------------------------------------------------------------------
@@ -193,7 +198,7 @@ class Guarded:
         before = {name: part if prior is None else prior[_GUARD + name][:, -1] for name, part in seen.items()}
         held = {_GUARD + name: torch.stack([before[name], part], 1) for name, part in seen.items()}
         laws = len(self.tolerances)
-        zeros = {"age": (), "broken": (laws,), "left": (laws,), "corrected": (), "asked": (), "way": (2,)}
+        zeros = {"age": (), "broken": (laws,), "left": (laws,), "corrected": (), "simulated": (), "way": (2,)}
         for name, shape in zeros.items():
             key = _GUARD + name
             held[key] = torch.zeros(batch, *shape, dtype=torch.float64) if prior is None else prior[key]
@@ -282,7 +287,7 @@ class Guarded:
         wrong: Tensor,
         action: Tensor,
         seeds: Tensor,
-    ):
+    ) -> tuple[State, Trajectory, Tensor]:
         """The best of several predictions of the broken steps."""
         bare, best = _bare(state), ratios.amax(1) if ratios.shape[1] else ratios.new_zeros(len(ratios))
         fresh = state[_GUARD + "age"] == 0

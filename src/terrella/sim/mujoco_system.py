@@ -19,7 +19,8 @@ def system_of(model: mujoco.MjModel) -> PhysicalSystem | None:
     Bodies are those with a free joint and one box or sphere, and driven ones whose position a framepos sensor gives. Other parts
     that move and collide are listed as hidden."""
     solid = (model.geom_contype > 0) | (model.geom_conaffinity > 0)
-    bodies, walls, hidden = [], [], []
+    bodies, walls, hidden, data = [], [], [], mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
     for at in range(1, model.nbody):
         geoms = [one for one in range(model.ngeom) if model.geom_bodyid[one] == at and solid[one]]
         root = model.body_weldid[at]
@@ -38,7 +39,7 @@ def system_of(model: mujoco.MjModel) -> PhysicalSystem | None:
             bodies.append(RigidBody(name, Slot(f"sensor.{sensor}"), **shape, driven=True))
     for geom in range(model.ngeom):
         if model.body_weldid[model.geom_bodyid[geom]] == 0 and solid[geom]:
-            wall = _wall(model, geom)
+            wall = _wall(model, data, geom)
             walls += [wall] if wall else []
             hidden += [] if wall else [model.geom(geom).name or f"geom {geom}"]
     limits = _limits(model)
@@ -70,12 +71,9 @@ def _free_body(model: mujoco.MjModel, at: int, name: str, geom: int, shape: dict
     )  # fmt: skip
 
 
-def _wall(model: mujoco.MjModel, geom: int) -> Wall | None:
-    turn, centre = np.zeros(4), np.zeros(3)
-    body = int(model.geom_bodyid[geom])
-    mujoco.mju_mulQuat(turn, model.body_quat[body], model.geom_quat[geom])
-    mujoco.mju_rotVecQuat(centre, model.geom_pos[geom], model.body_quat[body])
-    centre += model.body_pos[body]
+def _wall(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Wall | None:
+    turn, centre = np.zeros(4), data.geom_xpos[geom]
+    mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
     place = _triple(centre)
     if model.geom_type[geom] == int(_PLANE):
         normal = np.zeros(3)
