@@ -7,7 +7,7 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
-.PHONY: help play test test-all test-portable test-lerobot test-splats judge judge-cube check format bench clean
+.PHONY: help play test test-all test-portable test-lerobot test-splats judge judge-cube check format bench bench-gpu clean
 help:
 	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
 	@echo "make test    run the tests, in a real browser too"
@@ -20,6 +20,7 @@ help:
 	@echo "make check   format, lint, types, the directions of imports and the house rules"
 	@echo "make format  put the code into the form that make check asks for"
 	@echo "make bench   time the whole path of a frame (ARGS='--help' for its options)"
+	@echo "make bench-gpu  on a CUDA card: steps and training beside their bars, right or not, and what is slow (ARGS=--cpu rehearses)"
 	@echo "make clean   remove .venv and caches"
 
 play: $(VENV)/.ready-play
@@ -70,6 +71,10 @@ format: $(VENV)/.ready-dev
 
 bench: $(VENV)/.ready-dev
 	$(BIN)/python benchmarks/play.py $(ARGS)
+
+# On a bare machine with PyTorch, too: then with the python that is there.
+bench-gpu:
+	PYTHONPATH=src $$(test -x $(BIN)/python && echo $(BIN)/python || echo python3) benchmarks/gpu.py $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venv-lerobot .venv-judge .pytest_cache .ruff_cache .import_linter_cache .hypothesis build dist

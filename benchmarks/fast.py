@@ -18,7 +18,7 @@ import torch
 import tyro
 
 import terrella
-from terrella.worlds.fast import COMPILED, EAGER, ONNX, compiled_forward, example_inputs, onnx_forward
+from terrella.worlds.fast import EAGER, ONNX, example_inputs, onnx_forward
 
 DREAM = 32  # steps after which two ways' frames are compared
 
@@ -57,7 +57,7 @@ def ways_of(learned, compile: bool) -> tuple[dict[str, Callable], dict[str, floa
     given, eager = example_inputs(learned), learned.generator.forward
     makers = {EAGER: lambda: eager, ONNX: lambda: onnx_forward(learned.generator, given)}
     if compile:
-        makers[COMPILED] = lambda: compiled_forward(learned.generator)
+        makers["torch.compile"] = lambda: torch.compile(eager, dynamic=False)
     ways, took = {}, {}
     for name, make in makers.items():
         begun = time.perf_counter()

@@ -259,9 +259,9 @@ def _open_checkpoint(folder: Path, options: Mapping[str, Any]) -> World:
     rest = {name: value for name, value in options.items() if name != "fast"}
     if not options.get("fast"):
         return open_world(folder, **rest)
-    from .worlds.fast import with_faster_generator
+    from .worlds.fast import faster
 
-    return with_faster_generator(load_world(folder, **rest))[0]
+    return faster(load_world(folder, **rest))[0]
 
 
 def _require(module: str, need: str, extra: str) -> None:

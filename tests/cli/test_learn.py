@@ -110,6 +110,7 @@ def test_the_folder_is_named_after_the_environment(name, folder):
         ([NAME, "--minutes", "inf"], "--minutes"),
         ([NAME, "--frames", "1"], "--frames"),
         ([NAME, "--keys", "q=99"], "99"),
+        ([NAME, "--device", "tpu"], "--device tpu: PyTorch has no such device here; use cpu"),
     ],
 )
 def test_what_cannot_be_learned_is_said_and_leaves_nothing(given, said, tmp_path, capsys):

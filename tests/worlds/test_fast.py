@@ -17,7 +17,7 @@ from terrella.worlds import fast
 from terrella.worlds.carried_frames import PLANES
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
-from terrella.worlds.fast import EAGER, ONNX, compiled_forward, example_inputs, onnx_forward, with_faster_generator
+from terrella.worlds.fast import EAGER, ONNX, example_inputs, onnx_forward, with_faster_generator, with_step_programs
 from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import Conditioning, UNet, generate
 from terrella.worlds.learned import About, LearnedWorld
@@ -162,22 +162,17 @@ def test_fast_is_for_learned_worlds(capsys):
     assert "only a learned world can be drawn faster" in capsys.readouterr().err
 
 
-def test_other_batches_than_the_compiled_one_are_drawn_eagerly(monkeypatch):
-    """Without the compiler, which needs a minute: what matters here is who draws what."""
-    drawn = []
-
-    def compiler(function, mode, dynamic):
-        assert mode is None and dynamic is False
-        return lambda *given: (drawn.append(len(given[0])), function(*given))[1]
-
-    monkeypatch.setattr(torch, "compile", compiler)
-    world = small_world()
-    quick, given = compiled_forward(world.generator), example_inputs(world)
-    noisy, time, conditioning = given
-    two = (noisy.repeat(2, 1, 1, 1), time.repeat(2), repeated(conditioning, 2))
-    with torch.inference_mode():
-        assert quick(*given).shape[0] == 1 and quick(*two).shape[0] == 2 and quick(*given).shape[0] == 1
-    assert drawn == [1, 1]
+@pytest.mark.parametrize("quick", [True, False])
+def test_steps_are_programs_where_that_is_faster(quick, monkeypatch):
+    monkeypatch.setattr(fast, "alternating_ms", lambda ways: [2.0, 1.0 if quick else 3.0])
+    world = place(Controls.buttons(3))
+    chosen, choice = with_step_programs(world, None)
+    assert choice.way == ("traced" if quick else EAGER) and chosen.spec.card["fast"] == str(choice)
+    assert (chosen.stepper is not None) == quick and world.stepper is None, "the old world is as it was"
+    for one, other in zip(walk(world, 2, 3), walk(chosen, 2, 3)):
+        assert (one["rgb"].int() - other["rgb"].int()).abs().float().mean() < 1
+        torch.testing.assert_close(one["pose"], other["pose"])
+    assert chosen.replaced().stepper is None, "another world has its own"
 
 
 @pytest.mark.gpu

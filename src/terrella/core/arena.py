@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 
@@ -30,7 +31,7 @@ class Arena:
         self._crowd = 1000  # number of noted pointers above which dead ones are dropped
         with torch.inference_mode(False):
             self._rows = {name: self._blank(name, room) for name in self.parts}
-            self._free = torch.arange(1, room)
+            self._free = torch.arange(1, room, device=self.device)
 
     def __repr__(self) -> str:
         return f"Arena({', '.join(self.parts)}: {self.capacity} rows on {self.device})"
@@ -67,16 +68,35 @@ class Arena:
             shapes = {name: tuple(value.shape) for name, value in values.items()}
             raise ContractError(f"every part needs n rows of its shape, {self.parts}; got {shapes}.")
         count = sizes.pop()
-        if self.device.type == "meta":
-            return torch.zeros(count, dtype=torch.int64, device=self.device)
+        with self._lock, torch.inference_mode(False), torch.no_grad():
+            rows = getattr(self._newest, "given", None)
+            rows = self.reserve(count) if rows is None else rows
+            for name, value in values.items():
+                self._rows[name].index_copy_(0, rows, value.detach().to(self._rows[name]))
+            return rows
+
+    def reserve(self, count: int) -> torch.Tensor:
+        """The numbers of `count` rows that are free, int64 [count]; they last as those of `keep` do."""
+        with self._lock, torch.inference_mode(False), torch.no_grad():
+            self.make_room(count)
+            rows, self._free = self._free[:count], self._free[count:]
+            self._newest.rows = rows
+            return self.hold(rows)
+
+    def make_room(self, count: int) -> None:
+        """Frees rows, and grows the arena where fewer than `count` are free."""
         with self._lock, torch.inference_mode(False), torch.no_grad():
             if count > len(self._free):
                 self._sweep(count)
-            rows, self._free = self._free[:count].to(self.device), self._free[count:]
-            for name, value in values.items():
-                self._rows[name].index_copy_(0, rows, value.detach().to(self._rows[name]))
-            self._newest.rows = rows
-            return self.hold(rows)
+
+    @contextmanager
+    def writing_to(self, rows: torch.Tensor) -> Iterator[None]:
+        """Inside, `keep` in this thread writes to these rows, which were reserved: for steps that are traced once and run often."""
+        self._newest.given = rows
+        try:
+            yield
+        finally:
+            self._newest.given = None
 
     def hold(self, pointer: torch.Tensor) -> torch.Tensor:
         """Keeps the rows in `pointer` (int64 of any shape) for as long as that tensor lives; returns it."""
@@ -115,15 +135,18 @@ class Arena:
 
     def _sweep(self, count: int) -> None:
         """Frees the rows that no pointer holds; grows the arena where fewer than `count`, or few, are free."""
-        free = (~self.used().cpu()).nonzero()[:, 0]
         before = self.capacity
+        if self.device.type == "meta":  # which has no values
+            free = self._free[:0]
+        else:
+            free = (~self.used()).nonzero()[:, 0]
         if len(free) < max(count, before // 4):  # with few free rows it would sweep again soon
             more = max(before, count)
             for name, old in self._rows.items():
                 grown = self._blank(name, before + more)
                 grown[:before] = old
                 self._rows[name] = grown
-            free = torch.cat([free, torch.arange(before, before + more)])
+            free = torch.cat([free, torch.arange(before, before + more, device=self.device)])
         self._free = free
 
     def _blank(self, name: str, rows: int) -> torch.Tensor:

@@ -18,7 +18,7 @@ from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
-from .opening import ControlsConfig, EnvironmentConfig
+from .opening import ControlsConfig, Device, EnvironmentConfig, describe_device, device_of
 from .progress import Progress, Report, duration, silent, stage, stopping_with
 from .recording_facts import describe, recording_facts
 from .results import changed_settings, command, jsonable
@@ -53,6 +53,7 @@ class LearnConfig:
     frames: int = 20_000  # Frames to record at most; recording ends sooner after an eighth of the time.
     generator: Literal["codec", "flow"] = "codec"  # How a world without depth is drawn; see `train video`.
     seed: int = 0  # The same seed gives the same result.
+    device: Device = "auto"
     controls: ControlsConfig = ControlsConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
 
@@ -95,12 +96,14 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     The same call continues where an earlier one was stopped. TerrellaError for what cannot be learned.
     """
     check_budget(config.minutes, config.frames)
+    device_of(config.device)
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed}
     settings |= asdict(config.environment) | asdict(config.controls)
     schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes)
     if SCORING in schedule.facts:
         progress(f"{schedule.folder} is finished; --minutes with more than {schedule.minutes:g} trains it further.")
     else:
+        progress(f"{schedule.folder} is learned on {describe_device(device_of(config.device))}")
         _Learning(environment, config, schedule, progress).run()
     score = schedule.facts[SCORING]
     card = Path(score["card"]) if "card" in score else None
@@ -233,7 +236,9 @@ class _Learning:
         folder = self.schedule.folder
         hours = self.schedule.share_s[TRAINING] / 3600
         config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
-        config = replace(config, strip_every_s=self._strip_s, generator=self.config.generator)
+        config = replace(
+            config, strip_every_s=self._strip_s, generator=self.config.generator, device=self.config.device
+        )
         facts = train_video(folder / RECORDING, folder / "run", config, report, self._paced)
         return {"world": facts["world"], "steps": facts["step"]}
 
@@ -244,7 +249,7 @@ class _Learning:
     def _score(self, report: Report) -> dict[str, object]:
         schedule = self.schedule
         run, data = str(schedule.folder / "run"), schedule.folder / RECORDING
-        arms, closing = arms_of(run, "auto", fast=False, quick=True)
+        arms, closing = arms_of(run, self.config.device, fast=False, quick=True, progress=self.progress)
         try:
             exam, identity = _longest_exam(
                 ExamRequest(arms, closing, data, clips=max(CLIP_COUNTS), drift=0, seed=self.config.seed), report

@@ -109,10 +109,23 @@ def load_named(
     options: dict[str, Any] = {**remembering, **({"fast": True} if fast else {})}
     if not library.is_truth(name):
         options |= {"device": device_of(device), "memory": memory}
+        if options["device"] != "cpu":
+            progress(f"{name} runs on {describe_device(options['device'])}")
     world = library.load(name, **options)
     if fast:
         progress(f"{name}: {world.spec.card.get('fast')}")
     return world
+
+
+def describe_device(name: str) -> str:
+    """A device of `device_of` in words: what it is, its memory in GiB or its threads."""
+    import torch
+
+    device = torch.device(name)
+    if device.type == "cuda":
+        facts = torch.cuda.get_device_properties(device)
+        return f"{name} ({facts.name}, {facts.total_memory / 2**30:.0f} GiB)"
+    return f"{name} ({torch.get_num_threads()} threads)" if device.type == "cpu" else name
 
 
 def device_of(name: str) -> str:

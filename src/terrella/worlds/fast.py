@@ -1,4 +1,4 @@
-"""Fast play: a learned world's generator through ONNX Runtime, or torch.compile on a GPU, where that is faster.
+"""Fast play: on a CPU a world's generator through ONNX Runtime, on a GPU its steps as CUDA graphs, where that is faster.
 
 The graph is made in memory when the world is loaded; nothing is stored and nothing unpickled.
 """
@@ -23,6 +23,8 @@ from ..core.world import make_rng
 from ..space.keyframes import Glimpse
 from .generator import Conditioning, UNet
 from .learned import LearnedWorld
+from .parts import newest_frame
+from .step_program import StepPrograms
 
 Forward = Callable[..., torch.Tensor]
 TURNS = 15  # frames that each way draws in the comparison
@@ -30,7 +32,7 @@ TURNS = 15  # frames that each way draws in the comparison
 
 @dataclass(frozen=True)
 class Choice:
-    """The faster way; milliseconds a frame of the generator alone (medians of alternating runs), seconds to prepare it."""
+    """The faster way; milliseconds a frame, on a CPU of the generator alone, medians of alternating runs; seconds to prepare it."""
 
     way: str
     eager_ms: float
@@ -42,20 +44,47 @@ class Choice:
         return f"{self.way}: {other}, eager torch {self.eager_ms:.1f} ms; {self.prepared_s:.1f} s to prepare"
 
 
-EAGER, ONNX, COMPILED = "eager torch", "ONNX Runtime", "torch.compile"
+EAGER, ONNX = "eager torch", "ONNX Runtime"
+
+
+def faster(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
+    """The world with the faster of two ways, and which it is: on a CPU eager torch or ONNX Runtime for the generator; on a GPU
+    steps as they are or as compiled programs, CUDA graphs (step_program.py). Frames that need a gradient are drawn by eager torch.
+    TerrellaError where ONNX Runtime is not installed."""
+    return with_faster_generator(world) if world.device.type == "cpu" else with_step_programs(world)
+
+
+def with_step_programs(world: LearnedWorld, compiler: str | None = "inductor") -> tuple[LearnedWorld, Choice]:
+    """The world whose steps are programs of one launch, one for each batch size, made when the size is first met, if they are
+    faster than its steps as they are."""
+    began, rng = time.perf_counter(), make_rng(0)
+    quick = world.replaced()
+    programs = quick.stepper = StepPrograms(quick, compiler)
+    state, action = world.start(1, rng), world.spec.sample_action(1, rng)
+
+    def frame(one: LearnedWorld) -> torch.Tensor:
+        return newest_frame(one.imagine(state, action, rng))
+
+    with torch.inference_mode():
+        frame(quick)
+        prepared = time.perf_counter() - began
+        eager_ms, program_ms = alternating_ms([lambda: frame(world), lambda: frame(quick)])
+    choice = Choice(programs.programs[1].way if program_ms < eager_ms else EAGER, eager_ms, program_ms, prepared)
+    chosen = world.replaced(card={"fast": str(choice)})
+    if program_ms < eager_ms:
+        chosen.stepper = programs
+    return chosen, choice
 
 
 def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
-    """The world with the faster of two ways of drawing, and which it is: eager torch, or ONNX Runtime on a CPU and a compiled
-    graph on a GPU. Frames that need a gradient are drawn by eager torch. TerrellaError where ONNX Runtime is not installed."""
+    """The world whose generator draws by ONNX Runtime, if that is faster on this CPU."""
     generator: nn.Module = copy.deepcopy(world.generator)
     if not isinstance(generator, UNet):
         raise TerrellaError("--fast is for worlds with depth and poses; play this one without it.")
     inputs = example_inputs(world)
-    on_cpu = world.device.type == "cpu"
     began = time.perf_counter()
     eager: Forward = generator.forward
-    other = onnx_forward(generator, inputs) if on_cpu else compiled_forward(generator)
+    other = onnx_forward(generator, inputs)
     with torch.inference_mode():
         other(*inputs)
         prepared = time.perf_counter() - began
@@ -63,7 +92,7 @@ def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     wins = quick < slow
     if wins:
         vars(generator)["forward"] = _either(eager, other)
-    choice = Choice(EAGER if not wins else ONNX if on_cpu else COMPILED, slow, quick, prepared)
+    choice = Choice(ONNX if wins else EAGER, slow, quick, prepared)
     return world.replaced(generator=generator, card={"fast": str(choice)}), choice
 
 
@@ -115,21 +144,6 @@ def onnx_forward(generator: nn.Module, inputs: tuple) -> Forward:
         tensors = [tensor.numpy() for tensor in _flat(given)]
         wanted = [node.name for node in session.get_inputs()]
         return torch.from_numpy(session.run(None, {name: tensors[int(name[1:])] for name in wanted})[0])
-
-    return forward
-
-
-def compiled_forward(generator: nn.Module) -> Forward:
-    """The generator under torch.compile for one batch size, with CUDA graphs on a GPU; other batches are drawn eagerly. The
-    first frame waits for the compiler."""
-    on_gpu = next(generator.parameters()).device.type == "cuda"
-    eager: Forward = generator.forward
-    quick: Forward = torch.compile(eager, mode="reduce-overhead" if on_gpu else None, dynamic=False)
-    sizes: set[int] = set()
-
-    def forward(*given) -> torch.Tensor:
-        sizes.update([len(given[0])] if not sizes else [])
-        return quick(*given).clone() if len(given[0]) in sizes else eager(*given)  # a graph's output is overwritten
 
     return forward
 

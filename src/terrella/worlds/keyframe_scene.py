@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core import chance
+from ..core.backend import kernels_do
 from ..core.errors import ObservationError
 from ..core.spec import PLACES_UNIT
 from ..core.state import State
@@ -196,21 +197,19 @@ class KeyframeScene:
 
     def walls(self, state: State) -> tuple[State, Walls]:
         """The walls that recordings and evidence show. In episodes off known ground also those of dreamt frames, which are
-        drawn for that; the frames of the others may wait."""
-        away, own = self._away(state), state["observed_walls"]
+        drawn for that; the frames of the others may wait. Beside a CPU none waits, for nothing asks how many are away."""
+        cells, codes = self._cells, _cell_codes(state["pose"][:, :2])
+        gone = cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] != codes
+        own = state["observed_walls"]
+        if not kernels_do(own):
+            return state, Walls(self._plan, torch.where(gone[:, None, None], self.own.walls(state), own))
+        away = gone.nonzero()[:, 0]
         if len(away):
             drawn = state if len(away) == state.batch else state.narrowed(away)
             own = own.index_copy(0, away, self.own.walls(drawn))
             if drawn is not state and state.deferred is not None:
                 state = state.put(away, drawn)
         return state, Walls(self._plan, own)
-
-    def _away(self, state: State) -> torch.Tensor:
-        """The entries of the batch [n] that are not within NEAR_M of a recorded keyframe."""
-        cells, codes = self._cells, _cell_codes(state["pose"][:, :2])
-        if codes.is_meta:  # a meta tensor has no values
-            return torch.zeros(state.batch, dtype=torch.int64, device=codes.device)
-        return (cells[torch.searchsorted(cells, codes).clamp_max(len(cells) - 1)] != codes).nonzero()[:, 0]
 
     def look(self, state: State, before: State) -> Conditioning:
         """What is known of the view from the state's pose; `before` has the last frame."""

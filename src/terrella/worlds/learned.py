@@ -7,7 +7,7 @@ rollout that asks only for what the body decides never draws.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, final
@@ -76,6 +76,9 @@ class LearnedWorld:
         self.uncertainty: Uncertainty = _finished(uncertainty or NoUncertainty())
         self.estimator: Any = _finished(estimator or NoEstimator())
         self.history = max(self.body.history, scene.history)
+        self.stepper: Callable[[State, torch.Tensor, torch.Tensor], State] | None = (
+            None  # in place of `advance`: fast.py
+        )
         self.size = scene.config.size
         self._drawn_names = (*scene.drawn_names, *Expected._fields)
         self.spec = self._spec()
@@ -213,7 +216,11 @@ class LearnedWorld:
         """One step: move, then draw what is seen from there, now or when it is first read. Episodes that are over stand still."""
         numbers = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
         seeds = chance.seeds(state.batch, rng, self.device)
-        state, after = self.move(self.scene.adopt(state), numbers)
+        return (self.stepper or self.advance)(self.scene.adopt(state), numbers, seeds)
+
+    def advance(self, state: State, numbers: torch.Tensor, seeds: torch.Tensor) -> State:
+        """The part of `imagine` that is tensors alone: by actions [B, A] of `controls.encode` and seeds int64 [B]."""
+        state, after = self.move(state, numbers)
         still, ends = state["done"], self.body.ends(after, numbers)
         after = after.replace(**self.objects.step(state, after, seeds), gone=drift(state, after, led=False))
         after = self._draw(after, state, seeds, still)

@@ -108,7 +108,11 @@ class _Training:
         return {"world": str(self.run.out / "world"), **self.trainer.summary, **self.parts.facts, **senses}
 
     def new_trainer(self) -> Trainer:
-        feed = self.recipe.feed(self.config.batch or (64 if self.run.device.type == "cuda" else 8))
+        usual = self.config.batch or (64 if self.run.device.type == "cuda" else 8)
+        self.batch: int = (self.run.saved_facts("flow") or {}).get(
+            "batch", usual
+        )  # smaller after running out of memory
+        feed = self.recipe.feed(self.batch)
         objective = self.recipe.objective
         strides = objective.losses_per_batch
         return Trainer(self.run, "flow", feed, objective, self.config.steps, strides=strides)
@@ -119,7 +123,25 @@ class _Training:
         if not trainer.finished:
             discard_uncertainty(self.run.out)  # it was fitted to the errors of an earlier generator
             trainer.facts.pop("senses", None)
-        trainer.train(self._save_with_strip, self.paced)
+        self._train_within_memory()
+
+    def _train_within_memory(self) -> None:
+        """Trains to the end. Whenever the device runs out of memory, the batch is halved and training goes on from there."""
+        trainer = self.trainer
+        while True:
+            try:
+                return trainer.train(self._save_with_strip, self.paced)
+            except torch.cuda.OutOfMemoryError:
+                if self.batch == 1:
+                    raise TrainingError(
+                        f"{self.run.device} has too little memory for one clip; train smaller pictures (--size) or --channels, "
+                        "or on the CPU (--device cpu)."
+                    ) from None
+            self.batch //= 2
+            trainer.facts["batch"], trainer.feed = self.batch, self.recipe.feed(self.batch)
+            torch.cuda.empty_cache()
+            line = f"{self.run.device} ran out of memory: the batch is halved to {self.batch}, and training goes on"
+            self.run.report(min(trainer.share, 1.0), 1.0, line)
 
     def _limit_s(self) -> float:
         """Seconds of the generator's training: what the preparations left of the hours, less what tuning and uncertainty will
