@@ -32,6 +32,7 @@ def learn(
         return show(world_workflow.learn(name, config, progress=say), json)
     if config.controls != ControlsConfig():
         raise TerrellaError("--keys, --action-names and --idle are for a person who plays; --practise takes none.")
-    rounds = policy_workflow.PractiseConfig(config.minutes, config.out, config.frames, config.seed, config.environment)
+    shared = (config.minutes, config.out, config.frames, config.seed, config.environment, config.device)
+    rounds = policy_workflow.PractiseConfig(*shared)
     practised = policy_workflow.practise(name, rounds, progress=say)
     show(practised, json, command("terrella", "play", practised.world, agent=practised.policy))

@@ -32,7 +32,7 @@ from .collect import explore, storage_of
 from .learn import check_budget
 from .learn_schedule import folder_for, refuse_foreign_folder, refuse_other_settings
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, TRIAL_FRAMES, slower
-from .opening import EnvironmentConfig
+from .opening import Device, EnvironmentConfig, device_of
 from .progress import Progress, Report, silent, stage, stopping_with
 from .results import jsonable
 from .train_policy import PolicyTrial, try_policy
@@ -64,6 +64,7 @@ class PractiseConfig:
     frames: int = 20_000  # Frames to record at most, in all rounds.
     seed: int = 0  # The same seed gives the same result.
     environment: EnvironmentConfig = EnvironmentConfig()
+    device: Device = "auto"
 
 
 @dataclass(frozen=True)
@@ -219,10 +220,14 @@ def _round(
             batch=batch,
             seed=seed,
             save_every_s=SAVE_EVERY_S,
+            device=config.device,
         )
         paced = lambda steps: progress(line) if (line := slower(steps, config.minutes)) else None  # noqa: E731
         learned = train_latent(rounds.recording, rounds.world(number), latent, report, paced)
-    world, before = library.load(rounds.world(number)), done[-1]["frames"] if done else 0
+    world, before = (
+        library.load(rounds.world(number), device=device_of(config.device)),
+        done[-1]["frames"] if done else 0,
+    )
     notes = {"frames": Dataset(rounds.recording).length, "return": mean_return(rounds.recording, before)}
     notes |= {"collected_s": collected_s, "world_steps": learned["step"]}
     with stage(PRACTISING, progress) as report:

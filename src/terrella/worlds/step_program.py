@@ -110,8 +110,8 @@ def compiled(graph: torch.fx.GraphModule, inputs: list[torch.Tensor], compiler: 
     try:
         run(inputs)
     except Exception as error:  # compilers fail in many ways
-        said = str(error).strip().splitlines()
-        reason = said[0] if said else type(error).__name__
+        lines = str(error).strip().splitlines()
+        reason = lines[0] if lines else type(error).__name__
         warnings.warn(f"torch.compile fails here ({reason}); steps run uncompiled.", stacklevel=2)
         return graph, "traced"
     return run, f"torch.compile ({compiler})"
