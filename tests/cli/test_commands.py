@@ -40,6 +40,7 @@ OPTIONS = {
     "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
     "--seed --size --spread --steps --success --task --temperature --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
+    "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",
     "check": "--coarse --data --device --fresh --json --out --rollouts --seed --steps --system",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

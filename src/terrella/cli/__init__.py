@@ -29,6 +29,7 @@ COMMANDS = {
         "studies:acceleration",
         "how much faster than real time a world imagines, beside MuJoCo",
     ),
+    "bench physics": ("physics:bench_physics", "how well worlds predict moving bodies, with and without a guard"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),

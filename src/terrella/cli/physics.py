@@ -1,5 +1,11 @@
-"""The command `terrella check`."""
+"""The commands `check` and `bench physics`."""
 
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ..workflows.bench_physics import BenchPhysicsConfig
+from ..workflows.bench_physics import bench_physics as run_bench
 from ..workflows.check import CheckConfig
 from ..workflows.check import check as run_check
 from ..workflows.results import command
@@ -16,3 +22,19 @@ def check(world: WorldName, config: CheckConfig, json: Json = False) -> None:
         world: The world to check: a name of `terrella list`, or a path.
     """
     show(run_check(world, config, progress=say), json, command("terrella", "score", world, data=config.data))
+
+
+def bench_physics(
+    config: BenchPhysicsConfig,
+    world: Annotated[str | None, Positional, arg(metavar="[WORLD]")] = None,
+    json: Json = False,
+) -> None:
+    """Compare predictions of moving bodies with the truth, within the ranges of training and beyond: a ball thrown, collisions,
+    bounces, a pendulum, rolling, stacking.
+
+    Beside the world, with and without its guard: copying, linear extrapolation, and the truth from a noisy start.
+
+    Args:
+        world: A latent world of such a family. Default: the baselines alone, or worlds that --train makes.
+    """
+    show(run_bench(world, config, progress=say), json, command("terrella", "play", "physics:bouncing"))
