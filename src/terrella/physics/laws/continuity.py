@@ -10,9 +10,15 @@ from ..trajectory import Trajectory
 from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
+def gentle(motion: Trajectory) -> Tensor:
+    """bool [T, B, N]: steps in flight, or in which the velocity changes by no more than gravity changes it."""
+    change = motion.velocity.diff(dim=0).norm(dim=-1)
+    return motion.clear | ((change < motion.gravity.norm() * motion.dt_s) & ~motion.tied)
+
+
 class Continuity:
-    """In flight, the displacement minus that of the mean velocity; in contact, what it exceeds the largest speed by. Of bodies
-    without a velocity: what it exceeds their declared speed by, or else what it differs from the displacement before."""
+    """In flight, and where the velocity hardly changes, the displacement minus that of the mean velocity; in impacts, what it
+    exceeds the largest speed by. Of bodies without a velocity: what it exceeds their declared speed by, or else its change."""
 
     name, unit = "continuity", "m"
 
@@ -33,7 +39,7 @@ class Continuity:
         change = (way - torch.cat([way[:1], way[:-1]])).norm(dim=-1)
         change = torch.where(fastest > 0, (way.norm(dim=-1) - fastest * dt_s).clamp_min(0), change)
         measured = torch.tensor([body.velocity is not None for body in motion.system.bodies])
-        return torch.where(measured, torch.where(motion.clear, smooth, rough), change)
+        return torch.where(measured, torch.where(gentle(motion), smooth, rough), change)
 
     def floor(self, motion: Trajectory) -> float:
         return SINGLE * float(motion.position.abs().max().clamp_min(1.0))
@@ -53,7 +59,7 @@ class Continuity:
         ahead = torch.where(
             (length > 1e-9)[:, None], way / length.clamp_min(1e-9)[:, None], random_directions(motion, seeds)
         )
-        slack = torch.where(motion.clear[step, rows, body], 0.0, (reach - length).clamp_min(0))
+        slack = torch.where(gentle(motion)[step, rows, body], 0.0, (reach - length).clamp_min(0))
         return replace(
             motion, position=shifted(motion.position, step, body, ahead * (slack + size)[:, None], some)
         ), some
@@ -67,5 +73,5 @@ class Continuity:
         measured = torch.tensor([body.velocity is not None for body in motion.system.bodies])
         reach = torch.where(measured, reach, torch.where(fastest > 0, fastest * dt_s, way.norm(dim=-1)))
         short = way * (reach / way.norm(dim=-1).clamp_min(1e-12)).clamp_max(1)[..., None]
-        smooth = (motion.clear[-1] & measured)[..., None]
+        smooth = (gentle(motion)[-1] & measured)[..., None]
         return with_last(motion, position=motion.position[-2] + torch.where(smooth, mean, short))
