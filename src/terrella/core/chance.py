@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import torch
 
-from .backend import kernels_do
+from .backend import constant, kernels_do
 from .kernels_numba import halves
 
 GOLDEN, FIRST, SECOND = -0x61C8864680B583EB, -0x40A7B892E31B1A47, -0x6B2FB644ECCEEE15  # of splitmix64, as signed 64 bit
@@ -58,10 +58,18 @@ def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor,
 
 def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The same as `_halves` in plain tensor algebra, for GPUs."""
-    key = _hashed(seeds + _hashed(torch.full_like(seeds, stream)))[:, None]
-    mixed = _hashed(key + torch.arange(count, device=seeds.device) * GOLDEN)
+    key = _hashed(seeds + constant(_stream, seeds.device, stream))[:, None]
+    mixed = _hashed(key + constant(_steps, seeds.device, count))
     high, low = (mixed >> 40) & 0xFFFFFF, (mixed >> 8) & 0xFFFFFF
     return high.float() * 2.0**-24, low.float() * 2.0**-24
+
+
+def _stream(number: int) -> torch.Tensor:
+    return _hashed(torch.tensor(number))
+
+
+def _steps(count: int) -> torch.Tensor:
+    return torch.arange(count) * GOLDEN
 
 
 def _hashed(x: torch.Tensor) -> torch.Tensor:

@@ -64,18 +64,18 @@ def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Ten
     """The same as `straight_runs`, in plain tensor algebra, also for GPUs: lines through all runs at once, then the longest from
     every column, and of these a choice from left to right."""
     count, width = inverse.shape
-    columns = torch.arange(width, device=inverse.device)
+    columns = constant(torch.arange, inverse.device, width)
     near, far = 1 / inverse, left / inverse
-    joins = (near.diff(dim=1).square() + far.diff(dim=1).square()).sqrt() <= GAP_M
+    joins = torch.hypot(near.diff(dim=1), far.diff(dim=1)) <= GAP_M
     joins &= (inverse[:, 1:] >= 1 / SEEN_M) & (inverse[:, :-1] >= 1 / SEEN_M)
     # [K, first, last] of runs from column `first` to column `last`; sums over them by differences of sums from the left
-    mean, middle, square, both = (_means(part) for part in (inverse, left, left.square(), left * inverse))
+    mean, both = _means(torch.stack([inverse, left * inverse]))
+    middle, square = _means(torch.stack([left, left.square()]))
     spread = (square - middle.square()).clamp_min(1e-12)
     slope = (both - middle * mean) / spread
     level = mean - slope * middle
-    within = (columns >= columns[:, None])[:, None] & (columns <= columns[:, None])  # [first, last, column]
     off = (slope[..., None] * left + level[..., None] - inverse[:, None, None]).abs()
-    off = torch.where(within, off, 0.0).amax(-1)
+    off = (off * constant(_within, inverse.device, width)).amax(-1)
     most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
     broken = F.pad((~joins).cumsum(1), (1, 0))
     fits = (off <= STRAIGHT * most) & (broken[:, None] == broken[:, :, None]) & (columns > columns[:, None])
@@ -100,8 +100,19 @@ def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Ten
 def _means(values: torch.Tensor) -> torch.Tensor:
     """Means [..., first, last] of the values [..., w] from one column to another; meaningless where last < first."""
     sums = F.pad(values.cumsum(-1), (1, 0))
-    columns = torch.arange(values.shape[-1], device=values.device)
-    return (sums[..., None, 1:] - sums[..., :-1, None]) / (columns - columns[:, None] + 1).clamp_min(1)
+    return (sums[..., None, 1:] - sums[..., :-1, None]) / constant(_lengths, values.device, values.shape[-1])
+
+
+def _lengths(width: int) -> torch.Tensor:
+    """[first, last]: columns from one to another, 1 where last < first."""
+    columns = torch.arange(width)
+    return (columns - columns[:, None] + 1).clamp_min(1)
+
+
+def _within(width: int) -> torch.Tensor:
+    """float64 [first, last, column]: 1 where a column lies between two others, 0 elsewhere."""
+    columns = torch.arange(width)
+    return ((columns >= columns[:, None])[:, None] & (columns <= columns[:, None])).double()
 
 
 def _corners(first, stop, slope, level, left) -> torch.Tensor:
