@@ -1,7 +1,7 @@
 """Two balls that bounce by chance: does a learned world keep both, and do they go each way as often as in truth?
 
     terrella record world gym:lab.bouncing_balls:BouncingBalls-v0 --frames 20000 --out recordings/balls
-    terrella train video recordings/balls --out runs/balls --generator flow --hours 0.5
+    terrella train video recordings/balls --out runs/balls --hours 0.5
     python -m lab.bouncing_balls runs/balls
 
 The game, 64 x 64 pixels: two white balls of 3 x 3, and a paddle that shows the action. At floor and ceiling a ball's sideways speed

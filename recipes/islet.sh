@@ -4,9 +4,7 @@
 set -e
 PATH=.venv/bin:$PATH
 terrella record world gym:Islet-v0 --frames 20000 --seed 0 --out recordings/islet
-OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 0.38
-# The bundled world was trained before worlds kept a ground; that was stitched for it (learn/moves.py: ground_of) from a recording
-# of 16,000 frames of seed 11.
+OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 1.9 --outcome-steps 400
 mkdir -p src/terrella/bundled
 rm -rf src/terrella/bundled/islet
 cp -r runs/islet/world src/terrella/bundled/islet

@@ -15,12 +15,9 @@ from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from terrella.core import make_rng
-from terrella.learn.moves import mosaics
-from terrella.learn.objectives.codec import RECORDED, CodecClips, CodecObjective, Spans
-from terrella.learn.objectives.flow_frames import FlowClips, FlowFrames
+from terrella.learn.objectives.flow_frames import RECORDED, FlowClips, FlowFrames
 from terrella.learn.objectives.scroll import LENGTH, ScrollClips, ScrollObjective
 from terrella.learn.trainer import TrainStep
-from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 
 _setup_privateuseone_for_python_backend("other")
@@ -75,31 +72,25 @@ def main() -> None:
     size, moves = (32, 40), torch.tensor([[0, 0], [1, 0], [0, -2]])
     over = (torch.arange(size[0]) < 5)[:, None].expand(size)
     now = TrainStep(RECORDED, 0.0, OTHER, np.random.default_rng(0), make_rng(0))
-    codec = Codec(CodecConfig(size, 4, 36 + 4 * 2, 2, 4, (8, 8)))
-    codec.moves[:] = moves
     truth = torch.randint(0, 256, (4, 7, 3, *size), dtype=torch.uint8, generator=make_rng(0))
-    clip = CodecClips(
-        truth, torch.zeros(4, 7, 2), mosaics(truth[:, :3], moves, over, torch.ones(4, 3, dtype=torch.bool))
-    )
     piece = ScrollClips(
         torch.cat([truth, truth[:, :1]], 1), torch.zeros(4, LENGTH, 36 + 4 * 2), torch.rand(4, 3 + LENGTH, 3)
     )
-    objective = CodecObjective(codec, 1e-3, Spans(0, 4, 3), 2.0, over)
     network = FlowNetwork(FlowConfig(size, 4, 36 + 4 * 2, 2, (8, 8, 8)))
     network.moves[:], network.over[:] = moves, over
-    flow = FlowFrames(network, 1e-3, Spans(0, 4, 3), 2.0)
+    flow = FlowFrames(network, 1e-3, 3, 2.0)
     seen = FlowClips(truth, torch.zeros(4, 7, 2), torch.randint(0, 256, (4, 3, 4, *size), dtype=torch.uint8))
     scrolling = object.__new__(ScrollObjective)  # without a recording
-    scrolling.scroll, scrolling.moves, scrolling.slots = objective.scroll, moves, 4
+    scrolling.scroll, scrolling.moves, scrolling.slots = network.scrolling, moves, 4
     with Pretended():
-        for module in (*objective.modules.values(), *flow.modules.values()):
+        for module in flow.modules.values():
             module.to(OTHER)
         try:
-            codec.moves + moves
+            network.moves + moves
         except RuntimeError:
             print("mixing is refused")
         late = replace(now, share=0.9)
-        for losses in (objective.losses(clip, now), flow.losses(seen, late), scrolling.losses(piece, now)):
+        for losses in (flow.losses(seen, late), scrolling.losses(piece, now)):
             for loss in losses:
                 assert loss.value.device == OTHER
                 print(f"{loss.learner} has a loss")

@@ -11,7 +11,7 @@ from tests.learn.stopping import quiet
 from terrella.act import Explorer
 from terrella.core import make_rng
 from terrella.data import RecordOptions, record
-from terrella.learn.objectives import stress
+from terrella.learn.objectives import scroll
 from terrella.learn.recipes.post_training import distil, train_dreams
 from terrella.learn.recipes.video import train_video
 from terrella.worlds.folder import load_world
@@ -20,6 +20,14 @@ from terrella.worlds.folder import load_world
 def recorded(world, folder, rows: int = 300):
     record(world, Explorer(world.spec), folder, rows, make_rng(0), options=RecordOptions(max_episode_steps=80))
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_scroll_steps():
+    """How a made-up picture scrolls is learned in a tenth of the steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scroll, "STEPS", 60)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -51,23 +59,10 @@ def bare_run(corridor, tmp_path_factory):
     return trained(tmp_path_factory, corridor, BARE)
 
 
-def fewer_rollouts(patch: pytest.MonkeyPatch) -> None:
-    """Of those by which a codec's stress is chosen (see test_stress.py)."""
-    patch.setattr(stress, "STEPS", (8, 4))
-    patch.setattr(stress, "CLIPS", 3)
-
-
-@pytest.fixture
-def few_rollouts(monkeypatch):
-    fewer_rollouts(monkeypatch)
-
-
 @pytest.fixture(scope="session")
 def flat_run(corridor, tmp_path_factory):
-    """A codec with an uncertainty, of the frames and actions of the same recording, by `few_rollouts`."""
-    with pytest.MonkeyPatch.context() as patch:
-        fewer_rollouts(patch)
-        return trained(tmp_path_factory, corridor, FLAT)
+    """A world with an uncertainty, of the frames and actions of the same recording."""
+    return trained(tmp_path_factory, corridor, FLAT)
 
 
 @pytest.fixture(scope="session")
@@ -77,7 +72,7 @@ def haunted_run(haunted, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def teacher(corridor, tmp_path_factory):
-    """A flat world of four steps a frame."""
+    """A world of four steps a frame."""
     return load_world(trained(tmp_path_factory, corridor, TEACHER)[0] / "world")
 
 

@@ -13,6 +13,6 @@ BARE = TrainConfig(
 )  # fmt: skip
 POSED = replace(BARE, estimator_steps=4, uncertainty_frames=60)
 FLAT = replace(BARE, geometry=False, steps=12, uncertainty_frames=60)
-TEACHER = replace(BARE, geometry=False, flow_steps=4, steps=3)
+TEACHER = replace(BARE, flow_steps=4, steps=3)
 STUDENT = DistilConfig(steps=3, batch=2)
 DREAMS = DreamsConfig(steps=2, horizon=3, batch=2)

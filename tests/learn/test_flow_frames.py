@@ -14,18 +14,16 @@ from tests.learn.stopping import quiet, resumes_exactly
 from terrella.core import check_world, make_rng
 from terrella.core.errors import TrainingError
 from terrella.data import Recorder
-from terrella.learn.moves import stitch_episodes
-from terrella.learn.objectives.codec import Spans
+from terrella.learn.moves import Scrolling, stitch_episodes
 from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
 from terrella.learn.recipes.video import train_video
-from terrella.learn.recipes.video_flat import codec_statistics, scrolls_of
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import TrainStep
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world
 
-SIZE, FLAT = (24, 32), replace(BARE, geometry=False, generator="flow", steps=32)
+SIZE, FLAT = (24, 32), replace(BARE, geometry=False, steps=32)
 MOVES = torch.tensor([[0, 0], [-2, 0], [2, 0]])
 
 
@@ -92,15 +90,14 @@ def test_a_moving_paddle_does_not_scroll_the_picture(recording, tmp_path):
             recorder.add({"rgb": picture}, np.array([row % 18 < 9]) if row < 119 else None, 0.0, False)
         recorder.end_episode()
     walled = Recording.open(tmp_path / "set", SIZE, quiet)
-    assert len(scrolls_of(walled, codec_statistics(walled, 0), 0)) == 1
-    assert len(scrolls_of(recording, codec_statistics(recording, 0), 0)) == 3
+    assert [len(Scrolling.of(one, 0, 1 << 20).moves) for one in (walled, recording)] == [1, 3]
 
 
 def learned(share: float) -> list[float]:
     """Losses of drafts of a dot that moves by two pixels, before and after 60 gradient steps."""
     torch.manual_seed(0)
     network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
-    objective, losses = FlowFrames(network, 5e-3, Spans(0, 2, 1), 4.0), []
+    objective, losses = FlowFrames(network, 5e-3, 1, 4.0), []
     frames = torch.zeros(8, 3, 3, 16, 16, dtype=torch.uint8)
     for row in range(3):
         for entry in range(8):

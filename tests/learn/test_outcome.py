@@ -12,11 +12,10 @@ from tests.learn.stopping import quiet
 
 from terrella.core import check_world, make_rng
 from terrella.data import ClipCache, Recorder
-from terrella.learn.history_batches import change_weight, clips_at, history_batch
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, controls_of
-from terrella.learn.trainer import Run, TrainStep
+from terrella.learn.trainer import Run
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world
 from terrella.worlds.frame_history import FrameHistory, StartClips
@@ -119,7 +118,6 @@ def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_rollouts")
 def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_path):
     config = TrainConfig(
         size=SIZE, steps=4, batch=2, outcome_steps=8, uncertainty_frames=0, strip_every_s=1e9, channels=(8, 8, 8)
@@ -150,32 +148,3 @@ def test_a_dream_pays_costs_lives_and_ends(learned):
     still = world.imagine(then, torch.tensor([2, 2]), rng)
     assert torch.equal(still.at(0)["frames"], then.at(0)["frames"]) and float(still["reward"][0]) == 0
     assert not torch.equal(still.at(1)["frames"], then.at(1)["frames"])
-
-
-def test_a_clip_that_is_shown_as_a_beginning_stood_still_and_nobody_had_acted(learned):
-    _, seen, _, _ = learned
-    config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, slots=4, geometry=False)
-    found, thumbnail = [], 36
-    for number in range(40):
-        now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(number), make_rng(number))
-        clips = clips_at(seen, config, 8, now.rng)
-        batch = history_batch(clips, seen.controls, config, now, None)
-        actions = batch.shown.context[:, thumbnail:].unflatten(1, (4, 3))
-        early = actions.sum(2) == 0
-        found.append(early.any(1))
-        for one in early.any(1).nonzero()[:, 0].tolist():
-            assert not early[one, 0], "the action that led to the target was recorded"
-            first = int(early[one].float().argmax())
-            shown = batch.shown.glimpse.rgb[one]
-            assert all(torch.equal(shown[first - 1 + k], shown[first - 1]) for k in range(1, 4 - first + 1))
-    assert torch.cat(found).any() and not torch.cat(found).all()
-
-
-def test_pixels_that_change_count_for_more_and_one_in_the_mean():
-    before = torch.full((2, 1, 3, 16, 16), 10, dtype=torch.uint8)
-    found = before[:, 0].clone()
-    found[0, :, 3, 4] = 200
-    weight = change_weight(found, before, often=20.0)
-    assert weight.mean().item() == pytest.approx(1.0, abs=1e-5)
-    assert weight[0, 0, 3, 4] / weight[0, 0, 0, 0] == pytest.approx(21.0, rel=1e-4)
-    assert (weight[1] == weight[1, 0, 0, 0]).all()

@@ -59,11 +59,6 @@ def tame(world):
     return world.replaced(generator=generator)
 
 
-def test_a_teacher_is_a_history_world_of_many_steps(teacher):
-    assert not teacher.config.geometry and teacher.config.steps == 4
-    assert teacher.config.channels == (8, 8, 8)
-
-
 def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(student_run, student, teacher):
     out, facts = student_run
     assert facts["step"] == 3 and student.config.steps == 1
@@ -101,7 +96,7 @@ def test_a_run_goes_on_only_from_the_world_and_the_settings_that_it_began_with(c
         train_dreams(places, corridor, dreams_run[0], DREAMS, quiet)
 
 
-@pytest.mark.parametrize("kind, data, seed", [("teacher", "corridor", 0), ("places", "corridor", 0),
+@pytest.mark.parametrize("kind, data, seed", [("places", "corridor", 0),
                                               pytest.param("places", "corridor", 1, marks=pytest.mark.slow),
                                               pytest.param("moving", "haunted", 0, marks=pytest.mark.slow)])  # fmt: skip
 def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, request):
@@ -114,11 +109,8 @@ def test_training_shows_the_generator_what_play_shows_it(kind, data, seed, reque
     state = dreams.state
     for step in range(4):
         action = pair.recording.action(dreams.row)
-        if kind == "teacher":
-            state = playing.imagine(state, action.to(torch.int8), make_rng(step))
-        else:
-            state = state.replace(actions=torch.cat([state["actions"][:, 1:], action[:, None]], 1))
-            state = playing.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, make_rng(step))
+        state = state.replace(actions=torch.cat([state["actions"][:, 1:], action[:, None]], 1))
+        state = playing.observe({"pose": pair.recording.pose(dreams.row + 1)}, state, make_rng(step))
         rgb, batch = playing.render(state, ("rgb",))["rgb"], dreams.next_batch()
         shown, clean = noted.pop()
         for one, other in ((shown.glimpse.rgb, batch.shown.glimpse.rgb), (shown.last, batch.shown.last)):
@@ -179,7 +171,7 @@ def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, cor
     monkeypatch.setattr(distillation, "half_precision", precision)
     pair = open_paired(tame(teacher), corridor, None, quiet)
     generator = copy.deepcopy(pair.world.generator).requires_grad_(True)
-    batch = pair.real(2, now(0))
+    batch = pair.feed(2).batch(now(0))
     noise, exits = torch.randn(batch.truth.shape, generator=make_rng(1)), set()
 
     def clean_at(x, step):
@@ -204,7 +196,7 @@ def test_of_the_flow_steps_only_the_one_drawn_at_random_has_a_gradient(half, cor
 
 def test_where_the_student_draws_as_the_teacher_nothing_pulls(corridor, teacher):
     pair = open_paired(tame(teacher), corridor, None, quiet)
-    batch, matching = pair.real(2, now(0)), Matching(teacher.generator)
+    batch, matching = pair.feed(2).batch(now(0)), Matching(teacher.generator)
     clean = batch.truth.clone().requires_grad_()
     (still,) = torch.autograd.grad(matching.towards_teacher(clean, batch.shown, make_rng(2)), clean)
     assert not still.any()
@@ -218,6 +210,13 @@ def test_where_the_student_draws_as_the_teacher_nothing_pulls(corridor, teacher)
 def test_a_world_of_one_step_teaches_nobody(corridor, places, tmp_path):
     with pytest.raises(TrainingError, match="--flow-steps 8"):
         distil(places, corridor, tmp_path, STUDENT, quiet)
+
+
+def test_flat_worlds_are_refused(flat_run, corridor, tmp_path):
+    flat = load_world(flat_run[0] / "world")
+    for further, config in ((distil, STUDENT), (train_dreams, DREAMS)):
+        with pytest.raises(TrainingError, match="for worlds that have"):
+            further(flat, corridor, tmp_path, config, quiet)
 
 
 def test_what_does_not_fit_is_refused(teacher, corridor, tmp_path):

@@ -13,7 +13,6 @@ from terrella.learn.objectives import scroll as stage
 from terrella.learn.objectives.scroll import ScrollObjective, learn_scroll
 from terrella.learn.recording import Recording
 from terrella.learn.trainer import Run
-from terrella.worlds.codec import CodecConfig
 from terrella.worlds.scroll import Scroll, least_off
 
 SIZE, SLOTS = (32, 40), 3
@@ -39,7 +38,7 @@ def walks(step: int = 2, length: int = 600) -> Recording:
 
 def scroll() -> Scroll:
     torch.manual_seed(0)
-    return Scroll(CodecConfig(SIZE, SLOTS, 36 + 2 * SLOTS, len(MOVES) - 1, 4))
+    return Scroll(SIZE, SLOTS, 36 + 2 * SLOTS, len(MOVES) - 1)
 
 
 def test_what_a_button_does_to_the_picture_is_learned(tmp_path, monkeypatch):

@@ -18,12 +18,12 @@ from terrella.core import Spec, check_world, make_rng
 from terrella.core.errors import CheckpointError, DatasetError, TrainingError
 from terrella.core.spec import Camera
 from terrella.data import ClipCache, Dataset, Layout, Recorder
+from terrella.learn import moves
 from terrella.learn.batches import Batch, augmented
-from terrella.learn.feeds import clips_of, frames_feed
-from terrella.learn.recipes import video_flat
+from terrella.learn.feeds import clips_of
 from terrella.learn.recipes.video import train_video
+from terrella.learn.recipes.video_flat import FLOW_ROLLOUT
 from terrella.learn.recording import Recording, choose_keyframes, usable_rows
-from terrella.learn.trainer import TrainStep
 from terrella.space.keyframes import Glimpse
 from terrella.worlds.checkpoint import data_file
 from terrella.worlds.config import VideoConfig
@@ -31,9 +31,6 @@ from terrella.worlds.folder import load_world, save_world
 from terrella.worlds.generator import Conditioning, context_thumbnail
 
 from ..data.layouts import layout_of
-
-pytestmark = pytest.mark.usefixtures("few_rollouts")
-QUICK_FLAT = replace(FLAT, outcome_steps=0, steps=2, uncertainty_frames=0)  # one batch of six gradient steps
 
 
 def test_a_trained_world_keeps_the_contract_with_memory_and_without(posed_run):
@@ -67,28 +64,6 @@ def test_a_run_that_is_stopped_in_each_of_its_stages_goes_on_exactly(corridor, p
     resumes_exactly(lambda out: train_video(corridor, out, FLAT, quiet), flat_run[0], tmp_path / "flat", stages)
 
 
-def test_a_kill_while_a_generator_is_tuned_leaves_its_world_and_it_draws_with_the_stress_chosen_later(
-    corridor, tmp_path, monkeypatch
-):
-    def killed(*_):
-        raise KeyboardInterrupt
-
-    def chosen(world, codec, recording, stress, seed, frames):
-        codec.stress.fill_(5.0)
-        return 1.4
-
-    monkeypatch.setattr(video_flat, "choose_stress", killed)
-    with pytest.raises(KeyboardInterrupt):
-        train_video(corridor, tmp_path, QUICK_FLAT, quiet)
-    assert load_world(tmp_path / "world").spec.card["steps"] == 6
-    monkeypatch.setattr(video_flat, "choose_stress", chosen)
-    for _ in range(2):  # the same command finishes it, and says again what was chosen
-        facts = train_video(corridor, tmp_path, QUICK_FLAT, quiet)
-        world = load_world(tmp_path / "world")
-        assert facts["step"] == 6 and facts["taken_back"] == 1.4 and world.generator.stress == 5
-        assert world.spec.card["taken_back"] == 1.4
-
-
 def test_a_training_that_fails_leaves_no_folder(corridor, tmp_path):
     with pytest.raises(TrainingError, match="multiples of 8"):
         train_video(corridor, tmp_path / "run", replace(BARE, size=(20, 30)), quiet)
@@ -120,9 +95,12 @@ def test_a_recording_without_depth_is_learned_from_history_alone(tmp_path, monke
     facts = train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)
     world = load_world(tmp_path / "run" / "world")
     steps = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[-1])["step"]
-    assert facts["step"] == steps == world.spec.card["steps"] == 6, "each loss that is descended is a step, everywhere"
-    assert (tmp_path / "run" / "strip-000006.png").exists()
-    monkeypatch.delattr(video_flat, "frequent_moves")  # what was found is not searched again
+    whole = -(-BARE.steps // FLOW_ROLLOUT) * FLOW_ROLLOUT
+    assert facts["step"] == steps == world.spec.card["steps"] == whole, (
+        "each loss that is descended is a step, everywhere"
+    )
+    assert (tmp_path / "run" / f"strip-{steps:06d}.png").exists()
+    monkeypatch.delattr(moves, "frequent_moves")  # what was found is not searched again
     assert train_video(tmp_path / "set", tmp_path / "run", BARE, quiet)["step"] == steps
     assert set(world.spec.channels) == {"rgb", "reward", "done"}
     assert "batches" in check_world(world)
@@ -259,20 +237,6 @@ def test_of_two_cameras_the_main_one_is_learned_and_the_other_named_as_ignored(t
     world = load_world(tmp_path / "run" / "world")
     assert "wrist" in str(world.spec.card["ignored channels"]) and world.spec.action_names == ("reach", "turn")
     assert isinstance(world.spec.action, spaces.Box) and world.spec.action.high.tolist() == [1, 2]
-
-
-def test_what_was_asked_for_reaches_training(tmp_path):
-    with Recorder(tmp_path / "set", layout_of(10.0, ("left",), rgb=(24, 32))) as recorder:
-        for task in ("open the door", "close the door", "open the door"):
-            recorder.task = task
-            for step in range(40):
-                seen = {"rgb": np.full((24, 32, 3), 40 + step, np.uint8)}
-                recorder.add(seen, np.array([step % 2]) if step < 39 else None, 0.0, False)
-            recorder.end_episode()
-    known = Recording.open(tmp_path / "set", (24, 32), quiet)
-    feed = frames_feed(known, None, VideoConfig((1, 1, 0.5, 0.5), 1, (24, 32), slots=4, geometry=False), 8, 0, None)
-    asked = feed.batch(TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))).instruction
-    assert asked.shape[0] == 8 and len(asked.unique(dim=0)) == 2
 
 
 def test_a_varied_batch_is_the_same_batch_in_another_world():

@@ -183,6 +183,12 @@ def test_a_run_goes_on_with_a_setting_that_is_newer_than_it_at_its_default_alone
         Trainer(Run.of(out, Newer(way="new"), quiet, free=("hours",)), "toy", Walk(), Toy(), STEPS)
 
 
+def test_a_run_goes_on_without_a_setting_that_is_gone(tmp_path):
+    out = tmp_path / "run"
+    Trainer(Run.of(out, Settings(), quiet, free=("hours",), generator="flow"), "toy", Walk(), Toy(), 2).train()
+    assert trainer_in(out, steps=2).finished
+
+
 def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path):
     broken = Toy(float("nan"))
     with pytest.raises(TrainingError, match="the loss is not a number at step 0"):

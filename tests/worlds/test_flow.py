@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 
 from terrella.core import check_world, make_rng
+from terrella.core.errors import CheckpointError
+from terrella.data import Layout
 from terrella.space.ground import window
-from terrella.space.mosaic import empty_mosaic, update_mosaic
+from terrella.space.mosaic import empty_mosaic, read_mosaic, update_mosaic
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import RECALLED, STAYS, FlowConfig, FlowNetwork
@@ -143,6 +146,89 @@ def test_it_is_loaded_as_it_was_saved(tmp_path):
         state = one.imagine(state, torch.tensor([[1, 0], [0, 1]], dtype=torch.int8), make_rng(1))
         frames.append(one.render(state, ("rgb",))["rgb"])
     assert (frames[0].int() - frames[1].int()).abs().max() <= 2, "weights are stored in half precision"
+
+
+def test_a_world_of_an_earlier_release_says_how_it_is_learned_again(tmp_path):
+    save_world(world(network()), tmp_path)
+    about = json.loads((tmp_path / "world.json").read_text())
+    about["parts"]["scene"]["config"]["fog_px"] = 12
+    (tmp_path / "world.json").write_text(json.dumps(about))
+    assert load_world(tmp_path).generator.kind == "flow", "a setting that is gone does no harm"
+    about["parts"]["generator"] = {"kind": "codec", "config": {"size": SIZE, "colours": 64}}
+    (tmp_path / "world.json").write_text(json.dumps(about))
+    with pytest.raises(CheckpointError, match="is drawn by a codec, .* terrella train video RECORDING --out NEW"):
+        load_world(tmp_path)
+
+
+def scrolling_to(move: int) -> LearnedWorld:
+    """A world whose pictures always go on by one of the moves."""
+    made = network()
+    made.scrolling.votes.bias.data = 99.0 * torch.nn.functional.one_hot(torch.tensor(move), len(MOVES)).float()
+    return world(made)
+
+
+def test_where_the_picture_scrolls_the_mosaic_is_shown_with_the_picture_in_its_middle():
+    made, rng = scrolling_to(1), make_rng(0)
+    state = made.imagine(made.start(2, rng), torch.zeros(2, 2, dtype=torch.int8), rng)
+    seen, (height, width) = made.render(state, ("rgb", "mosaic")), SIZE
+    assert seen["mosaic"].shape == (2, *made.spec.channels["mosaic"].shape)
+    known = seen["mosaic"][..., 3] > 0
+    top, left = (known.shape[1] - height) // 2, (known.shape[2] - width) // 2
+    assert known[:, top : top + height, left : left + width].all() and not known.all()
+    assert not seen["mosaic"][~known].any()
+    assert "mosaic" not in Layout.of(made.spec).channels, "recordings do without it"
+
+
+def test_a_mosaic_goes_on_as_the_picture_scrolls_though_it_is_too_plain_to_tell():
+    made, rng = scrolling_to(1), make_rng(0)
+    torch.nn.init.zeros_(made.generator.output.weight)
+    plain = {"rgb": torch.full((2, *SIZE, 3), 90, dtype=torch.uint8)}
+    state = made.observe(plain, None, rng)
+    for _ in range(3):
+        state = made.imagine(state, torch.zeros(2, 2, dtype=torch.int8), rng)
+    seen = made.render(state, ("mosaic",))["mosaic"][..., 3] > 0
+    assert seen.any(1).sum(1).tolist() == [SIZE[1] + 3 * 2] * 2
+    state = made.observe(plain, state, rng)  # how evidence went on is seen in its pictures alone
+    assert (made.render(state, ("mosaic",))["mosaic"][..., 3] > 0).any(1).sum(1).tolist() == [SIZE[1] + 2 * 2] * 2
+
+
+def test_what_lies_over_what_scrolls_is_no_part_of_the_mosaic_but_of_the_map():
+    made, rng = scrolling_to(0), make_rng(0)
+    made.scene.over[:4] = True
+    before = made.start(2, rng)
+    state = made.imagine(before, torch.zeros(2, 2, dtype=torch.int8), rng)
+    mosaic = made.look(state, before).mosaic
+    assert mosaic is not None
+    known = read_mosaic(mosaic, SIZE, torch.zeros(2, 2, dtype=torch.int64))[:, 3] > 0
+    assert not known[:, :4].any() and known[:, 4:].all()
+    seen = made.render(state, ("rgb", "mosaic"))
+    top, left = ((whole - part) // 2 for whole, part in zip(seen["mosaic"].shape[1:3], SIZE))
+    middle = seen["mosaic"][:, top : top + SIZE[0], left : left + SIZE[1]]
+    assert torch.equal(middle[:, :4, :, :3], seen["rgb"][:, :4]) and (middle[..., 3] > 0).all()
+    ground = state.replace(mosaic=torch.ones_like(state["mosaic"]))  # of colour 1, seen once
+    beneath = made.render(ground, ("mosaic",))["mosaic"][:, top : top + 4, left : left + SIZE[1], :3]
+    assert (beneath == 1).all(), "where the ground beneath is known, the map shows it"
+
+
+@pytest.mark.parametrize("device", ["meta"])
+def test_a_step_stays_on_its_device(device):
+    there = world(network()).to(device)
+    state = there.imagine(there.start(2, make_rng(0)), torch.zeros(2, 2, dtype=torch.int8), make_rng(0))
+    assert there.render(state, ("rgb",))["rgb"].device.type == device
+
+
+def test_over_its_ground_a_world_shows_what_was_recorded():
+    """Whatever its network would draw there: what comes into the picture is as the recordings saw it."""
+    ground = torch.randint(0, 256, (4, 48, 64), dtype=torch.uint8, generator=make_rng(3)).clamp_min(1)
+    made, rng = world(scrolling_to(2).generator, ground), make_rng(0)
+    torch.nn.init.zeros_(made.generator.output.weight)
+    picture = ground[None, :3, 20 : 20 + SIZE[0], 12 : 12 + SIZE[1]].permute(0, 2, 3, 1)
+    state = made.observe({"rgb": picture}, None, rng)
+    for step in range(1, 3):
+        state = made.imagine(state, torch.zeros(1, 2, dtype=torch.int8), rng)
+        assert state["place"].tolist() == [[12, 20 + 3 * step]]
+        truth = ground[:3, 20 + 3 * step :, 12 : 12 + SIZE[1]].permute(1, 2, 0)[: SIZE[0]]
+        assert torch.equal(made.render(state, ("rgb",))["rgb"][0], truth)
 
 
 def test_the_ground_of_the_recordings_is_known_from_every_start():

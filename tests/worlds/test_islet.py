@@ -28,7 +28,7 @@ def walked(world: World, action: str, steps: int, batch: int = 8) -> list[torch.
 
 def test_it_is_a_world_of_pictures_and_says_how_it_is_played(world):
     spec = world.spec
-    assert "pose" not in spec.channels and spec.channels["rgb"].shape == (80, 96, 3)
+    assert "pose" not in spec.channels and spec.channels["rgb"].shape == (80, 96, 3) and "mosaic" in spec.channels
     assert (
         spec.action_names == ("noop", "up", "down", "left", "right")
         and spec.keys
@@ -54,7 +54,7 @@ def test_the_picture_scrolls_as_it_is_told(world, action, way):
 
 @pytest.mark.parametrize("action", ["up", pytest.param("left", marks=pytest.mark.slow)])
 def test_a_walk_in_one_direction_stays_on_the_island(world, action):
-    """After 30 steps, where streaks used to fill the picture, it shows what the recordings saw there."""
+    """After 30 steps it shows what the recordings saw there."""
     rng, number = terrella.make_rng(0), world.spec.action_names.index(action)
     state = world.start(2, rng)
     for _ in range(30):
@@ -62,7 +62,7 @@ def test_a_walk_in_one_direction_stays_on_the_island(world, action):
     scene, frame = world.scene, state["frames"][:, 0]
     there = window(scene.ground, state["place"], scene.config.size)
     same = ((there[:, :3].int() - frame.int()).abs().amax(1) <= 8)[:, ~scene.over]
-    assert (same.float().mean(1) > 0.8).all() and float(world.render(state, ("known",))["known"].mean()) > 0.9
+    assert (same.float().mean(1) > 0.8).all()
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import torch
 from terrella.core import State, chance, make_rng
 from terrella.core.errors import ObservationError
 from terrella.worlds.body import FASTEST_M, NoBody
-from terrella.worlds.codec import Codec, CodecConfig
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
@@ -49,7 +48,7 @@ BUTTONS = Controls.buttons(3)
 
 
 def flat(kind: str) -> LearnedWorld:
-    """A frames-only world whose pictures a U-Net, a codec or a flow network draws."""
+    """A frames-only world whose pictures a U-Net or a flow network draws."""
     torch.manual_seed(0)
     config = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, (8, 8), slots=3, geometry=False)
     frames = torch.randint(0, 256, (4, 3, 3, *SIZE), dtype=torch.uint8, generator=make_rng(0))
@@ -58,9 +57,7 @@ def flat(kind: str) -> LearnedWorld:
         return LearnedWorld(About("flat", BUTTONS, 0.1), scene=scene, generator=generator)
     moves = ((0, 0), (1, 0), (0, 1))
     scene = FrameHistory(type(config.frames)(SIZE, 3, 3, moves), StartClips.of(frames, 3))
-    known = SIZE, 3, config.generator.context, len(moves) - 1
-    flow = kind == "flow"
-    generator = FlowNetwork(FlowConfig(*known, (8, 8, 8))) if flow else Codec(CodecConfig(*known, 8, (8, 8)))
+    generator = FlowNetwork(FlowConfig(SIZE, 3, config.generator.context, len(moves) - 1, (8, 8, 8)))
     generator.moves.copy_(torch.tensor(moves))
     return LearnedWorld(About(kind, BUTTONS, 0.1), scene=scene, generator=generator)
 
@@ -70,7 +67,6 @@ WORLDS = {
     "moving": lambda: place(BUTTONS, moving=True),
     "things": lambda: place(BUTTONS, moving=True, objects=True),
     "flat": lambda: flat("unet"),
-    "codec": lambda: flat("codec"),
     "flow": lambda: flat("flow"),
 }
 PROTOCOLS = {"body": Body, "scene": Scene, "generator": Generator, "objects": Objects, "outcome": Outcome}

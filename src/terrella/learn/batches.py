@@ -26,15 +26,14 @@ class Batch:
     shown: Conditioning
     truth: torch.Tensor
     weight: torch.Tensor | None = None  # [B, 1, H, W], of each pixel; None: uniform
-    instruction: torch.Tensor | None = None  # [B, D], the embedding of the task, if the recording has one
 
     def judged(self, clean: torch.Tensor) -> torch.Tensor:
         """Generated frames `clean`, with the truth where the weight is 0, so that neither losses nor critic see these pixels."""
         return clean if self.weight is None else torch.where(self.weight > 0, clean, as_generated(self.truth))
 
     def to(self, device) -> Batch:
-        weight, instruction = (None if part is None else part.to(device) for part in (self.weight, self.instruction))
-        return Batch(self.shown.to(device), self.truth.to(device), weight, instruction)
+        weight = None if self.weight is None else self.weight.to(device)
+        return Batch(self.shown.to(device), self.truth.to(device), weight)
 
 
 @torch.no_grad()

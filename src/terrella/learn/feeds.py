@@ -3,16 +3,14 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from ..core.errors import DatasetError
 from ..data import Clips, ClipsConfig
 from ..space.keyframes import Keyframes
 from ..worlds.config import VideoConfig
-from ..worlds.controls import Controls
 from .batches import Dream, place_batch
-from .history_batches import clip_length, history_batch
 from .moving_batches import moving_batch
-from .objectives import codec
-from .objectives.flow_frames import FlowClipMaker
 from .recording import Recording
 from .trainer import Feed, TrainStep
 
@@ -49,40 +47,28 @@ class ClipStream:
         self._stream = None
 
 
-def frames_feed(
-    recording: Recording, memory: Keyframes | None, config: VideoConfig, size: int, seed: int, dream: Dream | None
-) -> Feed:
-    """Batches of `size` for a generator: of places with a `memory`, else of clips."""
-    if memory is not None:
-        of_place = moving_batch if config.moving else place_batch
-        return RandomBatches(lambda now: of_place(recording, memory, config, size, now, dream))
-    clips = clips_of(recording, clip_length(config), size, config, seed)
-    controls = recording.controls or Controls.buttons(config.actions)
-    return ClipStream(clips, lambda rows, now: history_batch(rows, controls, config, now, dream))
+def place_feed(recording: Recording, memory: Keyframes, config: VideoConfig, size: int, dream: Dream | None) -> Feed:
+    """Batches of `size` views of places with a `memory`."""
+    of_place = moving_batch if config.moving else place_batch
+    return RandomBatches(lambda now: of_place(recording, memory, config, size, now, dream))
 
 
-def codec_feed(recording: Recording, config: VideoConfig, flow: codec.CodecObjective, size: int, seed: int) -> Feed:
-    """Clips for a codec, `size` at a time, chosen from three times as many, preferring those that change more."""
-    clips = clips_of(recording, flow.spans.length, 3 * size, config, seed, drop_last=False)
-    controls = recording.controls or Controls.buttons(config.actions)
-    return ClipStream(clips, codec.ClipMaker(controls, flow.generator.moves.cpu(), flow.over, flow.spans, size))
-
-
-def flow_feed(recording: Recording, config: VideoConfig, spans: codec.Spans, maker: FlowClipMaker, seed: int) -> Feed:
-    """Clips for a flow of frames, chosen from three times as many, preferring those that change more."""
-    return ClipStream(clips_of(recording, spans.length, 3 * maker.batch, config, seed, drop_last=False), maker)
-
-
-def clips_of(
-    recording: Recording, length: int, size: int, config: VideoConfig, seed: int, drop_last: bool = True
-) -> Clips:
-    """Clips of `length` rows, `size` at a time, of the episodes for training."""
+def clips_of(recording: Recording, length: int, size: int, config: VideoConfig, seed: int) -> Clips:
+    """Clips of `length` rows, up to `size` at a time, of the episodes for training."""
     ranges = recording.cache.episodes  # an episode with rows that are kept out is left out as a whole
     whole = [number for number in recording.seen if recording.usable[slice(*ranges[number])].all()]
     if not whole:
         raise DatasetError(f"every episode of {recording.name} comes to the part that is kept out; drop --keep-out.")
-    channels = ("rgb", "action", "row", *("instruction",) * ("task" in recording.cache.arrays))
-    return Clips(
-        recording.cache,
-        ClipsConfig(length, channels, size, config.size, seed=seed, drop_last=drop_last, episodes=whole),
-    )
+    channels = ("rgb", "action", "row")
+    settings = ClipsConfig(length, channels, size, config.size, seed=seed, drop_last=False, episodes=whole)
+    return Clips(recording.cache, settings)
+
+
+def fitting_rollout(lengths: np.ndarray, slots: int, most: int) -> int:
+    """The steps, up to `most`, that clips predict after a history of `slots` rows: as many as half of the rows of episodes of these
+    lengths allow. DatasetError if all are too short."""
+    rows = lambda steps: lengths[lengths >= slots + steps].sum()  # noqa: E731
+    tried = (most, most // 2, max(1, most // 4))
+    if not rows(tried[-1]):
+        raise DatasetError(f"no episode has the {slots + tried[-1]} rows that a clip has; record longer ones.")
+    return next(steps for steps in tried if rows(steps) >= 0.5 * rows(tried[-1]))

@@ -49,7 +49,7 @@ def frame_losses(
 ) -> dict[str, torch.Tensor]:
     """Mean absolute errors of encoded frames [B, 4, H, W]: colour, depth, and gradients of colour (edges).
 
-    With pixel weights [B, 1, H, W] (history_batches.change_weight) squared errors of colour are added: the minimum of absolute
+    With pixel weights [B, 1, H, W] squared errors of colour are added: the minimum of absolute
     errors alone is a frame in which nothing changes, as most pixels do not.
     """
     losses = {"rgb": _l1(clean[:, :3], truth[:, :3]), "depth": _l1(clean[:, 3:], truth[:, 3:])}

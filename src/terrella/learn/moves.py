@@ -1,9 +1,9 @@
-"""Statistics of a recording for codecs: the commonest moves of blocks, a palette, the overlay; and mosaics of clips."""
+"""How the pictures of a recording scroll: by which moves, what does not, and what was scrolled over."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import torch
 import torch.nn.functional as F
 
 from ..core.files import write_json
-from ..space.ground import cropped, joined, window
-from ..space.matching import gather_sources, half_pixel_bounds, scroll_index
+from ..space.ground import cropped, window
+from ..space.matching import scroll_index
 from ..space.mosaic import empty_mosaic, middle, update_mosaic
+from ..worlds.flow import carry
 from .recording import Recording
 
 REACH, NEAR = 24, 5  # pixels of the longest move in a step, and those up to which all moves are tried at full size
@@ -25,40 +26,62 @@ SAME = 8  # difference of 255 up to which a pixel is unchanged
 GROUND = 9  # height and width of the canvas on which an episode's pictures are stitched, in pictures
 STITCHED = 20_000  # frames at most
 FEWEST = 32  # scrolling pairs needed to find the overlay
+MOVES = 24  # of blocks, by which pictures may scroll
+SCROLLS, HALF = 0.01, 0.5  # see `Scrolling.of`
+PAIRS = 2000  # of successive pictures, in which scrolls are looked for
 STATISTICS = "looks.json"  # in the folder of a run
 
 
 @dataclass(frozen=True)
-class CodecStatistics:
-    """Statistics that a run computes once: moves int64 [n, 2], palette uint8 [n, 3], stress, the weight of pixels that change, and
-    over bool [H, W], what does not scroll (see overlay)."""
+class Scrolling:
+    """What a run computes once: moves int64 [n, 2] by which whole pictures scroll, (0, 0) first, and over bool [H, W], what does
+    not scroll (see overlay)."""
 
     moves: torch.Tensor
-    palette: torch.Tensor
-    stress: float
     over: torch.Tensor
 
     @staticmethod
-    def read(run: Path, recipe: Mapping) -> CodecStatistics | None:
+    def of(recording: Recording, seed: int, pixels: int) -> Scrolling:
+        """Of a recording, whose moves of blocks are searched in `pixels` of pairs that change. Whole pictures scroll by those moves
+        that lead from SCROLLS of the pictures or more to the next, and after which at most HALF as many pixels differ: a paddle
+        that moves does not scroll the picture."""
+        rng = np.random.default_rng(seed)
+        rows = recording.rows_within(1, 0)
+        rows = np.sort(rng.choice(rows, min(len(rows), PAIRS), replace=False))
+        before, after = recording.rgb(rows - 1), recording.rgb(rows)
+        still = changed_pixels(before, after).mean((1, 2))
+        change = still.numpy() + 1e-4
+        most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
+        some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
+        moves = F.pad(frequent_moves(before[some], after[some], MOVES), (0, 0, 1, 0))
+        index, over = scroll_index(before, after, moves), overlay(before, after, moves)
+        kept = [0]
+        for number in range(1, len(moves)):
+            at = (index == number).nonzero().flatten()
+            if len(at) >= SCROLLS * len(rows):
+                carried = [carry(before[part], index[part], moves, over) for part in at.split(256)]
+                if changed_pixels(torch.cat(carried), after[at]).mean() <= HALF * still[at].mean():
+                    kept.append(number)
+        return Scrolling(moves[kept], over & (len(kept) > 1))
+
+    @staticmethod
+    def read(run: Path, recipe: Mapping) -> Scrolling | None:
         """Those in the folder of a run of this recipe; None if there are none, or they are damaged: then they are computed
         again."""
         try:
             saved = json.loads((run / STATISTICS).read_text(encoding="utf-8"))
             moves = torch.tensor(saved["moves"], dtype=torch.int64).view(-1, 2)
-            colours = torch.tensor(saved["palette"], dtype=torch.int64).view(-1, 3)
-            stress, same = float(saved["stress"]), saved["recipe"] == json.loads(json.dumps(recipe))
+            same = saved["recipe"] == json.loads(json.dumps(recipe))
             over = torch.tensor([[{".": False, "#": True}[pixel] for pixel in row] for row in saved["over"]])
         except (OSError, ValueError, LookupError, TypeError, RuntimeError):
             return None
-        valid = same and (moves.abs() <= REACH).all() and ((colours >= 0) & (colours < 256)).all() and len(colours)
-        valid = valid and 0 < stress < float("inf") and over.ndim == 2
-        return CodecStatistics(moves, colours.to(torch.uint8), stress, over) if valid else None
+        valid = same and len(moves) and not moves[0].any() and (moves.abs() <= REACH).all() and over.ndim == 2
+        return Scrolling(moves, over) if valid else None
 
     def write(self, run: Path, recipe: Mapping) -> None:
         run.mkdir(parents=True, exist_ok=True)
-        facts = {"moves": self.moves.tolist(), "palette": self.palette.tolist(), "stress": self.stress}
-        facts["over"] = ["".join(".#"[pixel] for pixel in row) for row in self.over.int().tolist()]
-        write_json(run / STATISTICS, {"recipe": dict(recipe), **facts})
+        over = ["".join(".#"[pixel] for pixel in row) for row in self.over.int().tolist()]
+        write_json(run / STATISTICS, {"recipe": dict(recipe), "moves": self.moves.tolist(), "over": over})
 
 
 def frequent_moves(before: torch.Tensor, after: torch.Tensor, most: int) -> torch.Tensor:
@@ -95,48 +118,44 @@ def _commonest(
     return [moves[number] for number in order if counts[number] > 1]
 
 
-def palette(frames: torch.Tensor, colours: int, rng: np.random.Generator) -> torch.Tensor:
-    """At most `colours` colours of the pixels of `frames` (uint8 [N, 3, H, W]), by k-means: uint8 [n, 3]."""
-    pixels = frames.permute(0, 2, 3, 1).reshape(-1, 3)
-    pixels = pixels[torch.from_numpy(rng.integers(0, len(pixels), 60_000))]
-    shades, counts = torch.unique(pixels // 4, dim=0, return_counts=True)
-    shades, weight = shades.float() * 4 + 2, counts.float().sqrt()
-    often = weight.double().numpy()
-    first = rng.choice(len(shades), min(colours, len(shades)), replace=False, p=often / often.sum())
-    centres = shades[torch.from_numpy(first)]
-    for _ in range(12):
-        nearest = torch.cdist(shades, centres).argmin(1)
-        sums = torch.zeros_like(centres).index_add_(0, nearest, shades * weight[:, None])
-        whole = torch.zeros(len(centres)).index_add_(0, nearest, weight)[:, None]
-        centres = torch.where(whole > 0, sums / whole.clamp_min(1e-9), centres)
-    return centres.round().clamp(0, 255).to(torch.uint8)
-
-
 def overlay(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The pixels bool [H, W] that stay while the picture scrolls from `before` to `after` (uint8 [N, 3, H, W]), such as a status
     line or a player in the middle: those which, with their neighbourhood, are better explained by staying than by scrolling more
     often than the reverse. Holes are filled."""
     scroll = scroll_index(before, after, moves)
-    scrolls = scroll > 0
-    if scrolls.sum() < FEWEST:
-        return torch.zeros(before.shape[-2:], dtype=torch.bool)
-    stayed = scrolled_along = torch.zeros(before.shape[-2:])
-    for part in scrolls.nonzero().flatten().split(256):
-        stays, goes = _stay_or_scroll(before[part], after[part], moves, scroll[part])
+    scrolls = (scroll > 0).nonzero().flatten()
+    none = torch.zeros(before.shape[-2:], dtype=torch.bool)
+    if len(scrolls) < FEWEST:
+        return none
+    stayed = scrolled_along = none.float()
+    for part in scrolls.split(256):
+        one, other = before[part], after[part].int()
+        least, most = (carry(bound, scroll[part], moves, none) for bound in half_pixel_bounds(one))
+        goes = torch.maximum(least - other, other - most).amax(1) <= SAME
+        stays = changed_pixels(one, other) == 0
         stayed, scrolled_along = stayed + (stays & ~goes).sum(0), scrolled_along + (goes & ~stays).sum(0)
-    stayed, scrolled_along = stayed / scrolls.sum(), scrolled_along / scrolls.sum()
+    stayed, scrolled_along = stayed / len(scrolls), scrolled_along / len(scrolls)
     over = stayed + _around(stayed) > 2 * (scrolled_along + _around(scrolled_along)) + 0.02
     return over | (_around(over.float()) > 0.5)
 
 
-def _stay_or_scroll(
-    before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor, scroll: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels of `after` that are explained by staying, and by the `scroll` [N]: bool [N, H, W] each."""
-    along = scroll[:, None, None].expand(-1, *before.shape[-2:])
-    least, most = (gather_sources(bound[:, None], along, moves).int() for bound in half_pixel_bounds(before).unbind(1))
-    goes = torch.maximum(least - after.int(), after.int() - most).amax(1) <= SAME
-    return (before.int() - after.int()).abs().amax(1) <= SAME, goes
+def changed_pixels(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """1 where pictures uint8 [B, 3, H, W] differ by more than SAME, else 0: float [B, H, W]."""
+    return ((before.int() - after.int()).abs().amax(1) > SAME).float()
+
+
+def half_pixel_bounds(frame: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The minimum and the maximum colour int16 [B, 3, H, W] of each pixel of uint8 [B, 3, H, W] when the picture is displaced by up
+    to half a pixel: pictures scroll by fractions of pixels, but moves are whole."""
+    return _half_pixel_bound(frame, torch.minimum), _half_pixel_bound(frame, torch.maximum)
+
+
+def _half_pixel_bound(frame: torch.Tensor, least: Callable[..., torch.Tensor]) -> torch.Tensor:
+    bound = frame.to(torch.int16) * 16
+    for x, y in ((0, 1), (1, 0)):
+        near = least(_shifted(bound, x, y), _shifted(bound, -x, -y))
+        bound = least(bound, (bound + near) // 2)
+    return bound // 16
 
 
 def mosaics(frames: torch.Tensor, moves: torch.Tensor, over: torch.Tensor, real: torch.Tensor) -> torch.Tensor:
@@ -192,12 +211,6 @@ def stitch_episodes(recording: Recording, moves: torch.Tensor, over: torch.Tenso
             place[first:last] += centre - place[last - 1] - torch.stack([x, y])
             grounds[episode] = cropped(whole[0])
     return StitchedEpisodes(grounds, place, number)
-
-
-def ground_of(recording: Recording, moves: torch.Tensor, over: torch.Tensor) -> torch.Tensor:
-    """The ground (space/ground.py) over which the recording's episodes for training scrolled, uint8 [4, H, W]: their pictures
-    stitched, and those of several episodes where they overlap."""
-    return joined(list(stitch_episodes(recording, moves, over).grounds.values()))
 
 
 def _around(plane: torch.Tensor) -> torch.Tensor:

@@ -8,14 +8,12 @@ import torch
 
 from ..core.errors import DatasetError
 from ..data import Dataset, check_game
-from ..space.keyframes import Keyframes
 from ..worlds.generator import UNet
 from ..worlds.learned import LearnedWorld
-from .batches import Batch, Dream
-from .feeds import frames_feed
-from .history_batches import clips_at, history_batch
+from .batches import Dream
+from .feeds import place_feed
 from .recording import INSTANCES, OBJECTS, THINGS, Box, Recording, box_of
-from .trainer import Feed, Report, TrainStep
+from .trainer import Feed, Report
 
 
 @dataclass(frozen=True)
@@ -29,21 +27,9 @@ class Paired:
     def device(self) -> torch.device:
         return self.world.device
 
-    @property
-    def memory(self) -> Keyframes | None:
-        return self.world.memory.to("cpu") if self.world.config.geometry else None
-
-    def feed(self, batch: int, seed: int, dream: Dream | None = None) -> Feed:
-        """Batches as in `train video`; with `dream`, some of the last frames are generated."""
-        return frames_feed(self.recording, self.memory, self.world.config, batch, seed, dream)
-
-    def real(self, batch: int, now: TrainStep) -> Batch:
-        """One batch of recorded frames, drawn at random."""
-        if self.memory is not None:
-            return self.feed(batch, 0).batch(now)
-        config, recording = self.world.config, self.recording
-        clips = clips_at(recording, config, batch, now.rng)
-        return history_batch(clips, self.world.controls, config, now, None)
+    def feed(self, batch: int, dream: Dream | None = None) -> Feed:
+        """Batches as in `train video` of a world with poses; with `dream`, some of the last frames are generated."""
+        return place_feed(self.recording, self.world.memory.to("cpu"), self.world.config, batch, dream)
 
 
 def open_paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, report: Report) -> Paired:

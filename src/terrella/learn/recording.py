@@ -135,6 +135,17 @@ class Recording:
         whole = upto[rows + after + 1] - upto[rows - before] == before + after + 1
         return rows[whole & (self.start[rows - before] == self.start[rows + after])]
 
+    def steps_ahead(self) -> np.ndarray:
+        """For each row [N], the number of steps that can be rolled out from it: consecutive usable rows of its episode."""
+        fine = self.usable & np.asarray(self.cache.action_valid)
+        if self.cache.done is not None:
+            fine &= ~np.asarray(self.cache.done)
+        last = np.append(self.start[1:] != self.start[:-1], True)
+        ends = np.flatnonzero(~fine | last)
+        rows = np.arange(len(fine))
+        end = ends[np.searchsorted(ends, rows)]
+        return np.where(fine, end - rows + fine[end], 0)
+
     def rgb(self, rows) -> torch.Tensor:
         """uint8 [n, 3, H, W]"""
         return torch.from_numpy(np.ascontiguousarray(self.cache.rgb[rows])).permute(0, 3, 1, 2).contiguous()

@@ -35,6 +35,7 @@ LOG_EVERY = 20  # steps
 PACE_S = 30.0  # of training after which its pace is known, or sooner: after the first picture
 BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 CPU = torch.device("cpu")
+RETIRED = ("generator",)  # settings of earlier runs that no longer exist
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -184,6 +185,7 @@ class Run:
         """The facts of a stage that was begun; TrainingError if it had other settings, or another recording."""
         saved, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
         old = recipe if saved is None else saved.get("recipe", {})
+        old = {name: value for name, value in old.items() if name not in RETIRED}
         both = {name: value for name, value in recipe.items() if name in old or name not in self.usual} | old
         other = [
             f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
@@ -51,7 +51,6 @@ class LearnConfig:
     out: Path | None = None
     """Folder for the recording, the run and the score; default: learned/ and the environment's name."""
     frames: int = 20_000  # Frames to record at most; recording ends sooner after an eighth of the time.
-    generator: Literal["codec", "flow"] = "codec"  # How a world without depth is drawn; see `train video`.
     seed: int = 0  # The same seed gives the same result.
     device: Device = "auto"
     controls: ControlsConfig = ControlsConfig()
@@ -176,7 +175,7 @@ class _Learning:
         """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
         schedule = self.schedule
         self.progress("A trial of some seconds: what does this machine manage?")
-        pace = time_environment(world, self.config.seed, TrainConfig(generator=self.config.generator))
+        pace = time_environment(world, self.config.seed, TrainConfig())
         if pace is None:
             return
         recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
@@ -236,9 +235,7 @@ class _Learning:
         folder = self.schedule.folder
         hours = self.schedule.share_s[TRAINING] / 3600
         config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
-        config = replace(
-            config, strip_every_s=self._strip_s, generator=self.config.generator, device=self.config.device
-        )
+        config = replace(config, strip_every_s=self._strip_s, device=self.config.device)
         facts = train_video(folder / RECORDING, folder / "run", config, report, self._paced)
         return {"world": facts["world"], "steps": facts["step"]}
 

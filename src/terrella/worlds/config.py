@@ -53,7 +53,6 @@ class HistoryConfig:
     slots: int  # last frames that are kept
     actions: int  # numbers of an encoded action
     moves: tuple[tuple[int, int], ...] = ()  # x and y in pixels by which pictures scroll, (0, 0) first; none: no mosaic
-    fog_px: int = 0  # pixels beyond known ground from which a frame is fog; 0: it shows what it invents
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class FlowNetwork(nn.Module):
         fine, middle, coarse = config.channels
         self.register_buffer("moves", torch.zeros(config.moves + 1, 2, dtype=torch.int64))
         self.register_buffer("over", torch.zeros(config.size, dtype=torch.bool))
-        self.scrolling = Scroll(config) if config.moves else None
+        self.scrolling = Scroll(config.size, config.slots, config.context, config.moves) if config.moves else None
         self.actions = nn.Sequential(nn.Linear(config.context, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE), nn.SiLU())
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE))
         self.enter = nn.Conv2d(3 * config.slots, fine, SQUARE, stride=SQUARE)

@@ -25,7 +25,6 @@ from ..space.keyframes import Keyframes
 from . import splat_folder
 from .body import Motion, MotionBody
 from .checkpoint import WORLD_FILE, Tensors, data_file, read_about, read_data, write_about, write_checkpoint
-from .codec import Codec, CodecConfig
 from .config import GeneratorConfig, HistoryConfig, KeyframesConfig, MotionConfig
 from .controls import Controls
 from .flow import FlowConfig, FlowNetwork
@@ -47,6 +46,7 @@ Make = Callable[[Any, Tensors, Tensors], Any]
 # What reading a damaged folder may raise.
 DAMAGE = OSError, SafetensorError, RuntimeError, LookupError, AttributeError, TypeError, ValueError, zlib.error
 
+RETIRED = ("fog_px",)  # settings that no longer exist
 HALVED = ("uncertainty", "estimator")  # parts stored in half precision; so are the weights of a flow network
 
 
@@ -138,6 +138,11 @@ def load_world(
     if about.get("version") != VERSION or about.get("kind") != KIND:
         raise CheckpointError(_foreign(path, about))
     try:
+        if about["parts"]["generator"]["kind"] == "codec":
+            raise CheckpointError(
+                f"{path} is drawn by a codec, which this release no longer has; learn it again from its recording: "
+                "terrella train video RECORDING --out NEW."
+            )
         about, (weights, remembered) = read_data(path, about, "weights", "memory")
         made = {}
         for name, part in about["parts"].items():
@@ -233,7 +238,7 @@ def _foreign(path: Path, about: dict) -> str:
 
 def _settings(config: type, settings: dict) -> Any:
     """A config of its JSON, with tuples for lists."""
-    return config(**{name: _tuple(value) for name, value in settings.items()})
+    return config(**{name: _tuple(value) for name, value in settings.items() if name not in RETIRED})
 
 
 def _tuple(value: Any) -> Any:
@@ -283,7 +288,6 @@ KINDS: dict[str, dict[str, tuple[type, Make]]] = {
     "scene": {"keyframes": (KeyframesConfig, _places), "history": (HistoryConfig, _frames)},
     "generator": {
         "unet": (GeneratorConfig, _network(UNet)),
-        "codec": (CodecConfig, _network(Codec)),
         "flow": (FlowConfig, _network(FlowNetwork)),
     },
     "objects": {"billboards": (BillboardsConfig, _network(Billboards))},

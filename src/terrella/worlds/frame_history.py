@@ -1,8 +1,7 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
-The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture. With
-`fog_px` the mosaic holds evidence alone: this episode's, and the ground of the recordings where a picture is recognised on it.
-Beyond that, frames are shown as fog.
+The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture, and the
+ground of the recordings is known where a picture is recognised on it.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from typing import Any, final
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core import chance
@@ -69,14 +67,9 @@ class FrameHistory:
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
         self.ground = torch.zeros(4, 1, 1, dtype=torch.uint8, device=self.device) if ground is None else ground
-        self.grounded = len(self.moves) > 1 and self.ground[0].numel() > 1
-        flat = ("mosaic", "scroll") if config.moves else ()
-        self.drawn_names: tuple[str, ...] = (
-            "frames",
-            *flat,
-            *(("place",) if self.grounded else ()),
-            *(("known", "observed") if config.fog_px else ()),
-        )
+        self.grounded = bool(config.moves) and self.ground[0].numel() > 1
+        flat = ("mosaic", "scroll") * bool(config.moves)
+        self.drawn_names: tuple[str, ...] = ("frames", *flat, *("place",) * self.grounded)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
 
@@ -90,11 +83,9 @@ class FrameHistory:
 
     def channels(self) -> Channels:
         shows: dict[str, spaces.Space] = {"rgb": spaces.Box(0, 255, (*self.config.size, 3), np.uint8)}
-        if len(set(self.config.moves)) > 1:  # with one move nothing ever scrolls, and the mosaic is the frame
+        if self.config.moves:
             height, width = (times * length for times, length in zip(PICTURES, self.config.size))
             shows["mosaic"] = spaces.Box(0, 255, (height, width, 4), np.uint8)
-        if self.config.fog_px:
-            shows["known"] = spaces.Box(0, 1, self.config.size, np.float32)
         return Channels(shows, observes=("rgb",))
 
     # -- evidence -----------------------------------------------------------------------------------------------------
@@ -132,9 +123,6 @@ class FrameHistory:
             shown = ~self.over.expand(len(frames), -1, -1)
             place, share = locate(frames[:, 0], shown, self.ground)
             seen["place"] = torch.where(share[:, None] >= ALIKE, place, self._followed(prior, seen["scroll"]))
-        if self.config.fog_px:
-            seen["known"] = torch.full_like(frames[:, 0, 0], 255)
-            seen["observed"] = torch.ones(len(frames), dtype=torch.bool, device=self.device)
         return State(seen) if prior is None else prior.replace(**seen)
 
     def _followed(self, prior: State | None, scroll: torch.Tensor) -> torch.Tensor:
@@ -160,11 +148,8 @@ class FrameHistory:
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
         last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
         familiar = torch.zeros(state.batch, 2, device=self.device)
-        if not self.config.moves:
-            return Conditioning(glimpse_of_frames(frames), last, context, familiar)
-        over = self.over.expand(len(frames), -1, -1)
-        joined, alone = self._joined(state), self.config.fog_px > 0
-        return Conditioning(glimpse_of_frames(frames), last, context, familiar, joined, over, evidence=alone)
+        mosaic = self._joined(state) if self.config.moves else None
+        return Conditioning(glimpse_of_frames(frames), last, context, familiar, mosaic)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
@@ -172,26 +157,19 @@ class FrameHistory:
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
         if self.grounded and scroll is not None:
             flat["place"] = state["place"] - self.moves[scroll]
-        if self.config.fog_px and scroll is not None:
-            flat["known"] = (conditioning.glimpse.known * 255).to(torch.uint8)
-            flat["observed"] = torch.zeros_like(state["observed"])
         return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:
         """The mosaic with the newest frame in its middle. A state's mosaic lags by a frame, which evidence may still replace. It
-        scrolls by the move that was drawn: new ground is often too plain to estimate the move from. With fog it takes observed
-        frames alone, and what it lacks from the ground."""
+        scrolls by the move that was drawn: new ground is often too plain to estimate the move from. The ground of the recordings
+        comes first."""
         frame, move = state["frames"][:, 0], self.moves[state["scroll"]]
         whole = update_mosaic(state["mosaic"], frame, move, self.over)
         if not self.grounded:
             return whole
         at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
         ground = window(self.ground, at, (whole.shape[2], whole.shape[3]))
-        if not self.config.fog_px:
-            return torch.where(ground[:, 3:] > 0, ground, whole)
-        unchanged = update_mosaic(state["mosaic"], frame, move, torch.ones_like(self.over))
-        whole = torch.where(state["observed"].view(-1, 1, 1, 1), whole, unchanged)
-        return torch.where(whole[:, 3:] > 0, whole, ground)
+        return torch.where(ground[:, 3:] > 0, ground, whole)
 
     def _whole(self, state: State) -> torch.Tensor:
         """The mosaic; where it is empty, what lies over it."""
@@ -202,12 +180,7 @@ class FrameHistory:
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         shown = {}
         if "rgb" in channels:
-            frame = newest_frame(state)
-            if self.config.fog_px:
-                frame = fogged(frame, state["known"], state["mosaic"], self.config.fog_px)
-            shown["rgb"] = frame.permute(0, 2, 3, 1).contiguous()
-        if "known" in channels:
-            shown["known"] = state["known"].float() / 255
+            shown["rgb"] = newest_frame(state).permute(0, 2, 3, 1).contiguous()
         if "mosaic" in channels:
             shown["mosaic"] = _shown(self._whole(state))
         return shown
@@ -217,18 +190,6 @@ def _shown(mosaic: torch.Tensor) -> torch.Tensor:
     """The channel `mosaic` (core/world.py) of mosaics uint8 [B, 4, H', W'] of colour and votes."""
     seen = (mosaic[:, 3:] > 0).to(torch.uint8) * 255
     return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
-
-
-def fogged(frame: torch.Tensor, known: torch.Tensor, mosaic: torch.Tensor, reach: int) -> torch.Tensor:
-    """Pictures uint8 [B, 3, H, W] whose unknown pixels (known uint8 [B, H, W] is 0) fade, within `reach` pixels of known ones, into
-    fog of the mean colour of the mosaic's seen pixels."""
-    seen = known[:, None].float() / 255
-    some = mosaic[..., ::4, ::4].float()
-    votes = (some[:, 3:] > 0).float()
-    colour = (some[:, :3] * votes).sum((2, 3), keepdim=True) / votes.sum((2, 3), keepdim=True).clamp_min(1)
-    near = F.avg_pool2d(seen, 2 * reach + 1, 1, reach, count_include_pad=False)
-    share = (1 - seen) * (1 - 2 * near).clamp(0, 1)
-    return torch.lerp(frame.float(), colour.expand_as(frame), share).round().to(torch.uint8)
 
 
 def glimpse_of_frames(frames: torch.Tensor) -> Glimpse:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar, final
+from typing import TypeVar, final
 
 import torch
 import torch.nn.functional as F
@@ -28,8 +28,8 @@ class Conditioning:
     glimpse: what the scene knows of the view. last [B, 4, H, W]: the last frame carried into the view, colour in [0, 1] and
     trust; where things move [B, 4 + PLANES, H, W] (carried_frames.py). context [B, n]: thumbnail of the last frame, in some
     worlds also the last actions. familiar [B, 2]: how well the place is known, for the uncertainty (keyframe_scene.py).
-    Of a flat world: mosaic uint8 [B, 4, H', W'] (space/mosaic.py); over bool [B, H, W], what lies over it; scroll int64 [B], by
-    which of the codec's moves most of the picture goes on; evidence: whether the mosaic holds no invented pixels.
+    Of a flat world: mosaic uint8 [B, 4, H', W'] (space/mosaic.py); scroll int64 [B], by which of the generator's moves most of
+    the picture goes on.
     """
 
     glimpse: Glimpse
@@ -37,9 +37,7 @@ class Conditioning:
     context: torch.Tensor
     familiar: torch.Tensor | None = None
     mosaic: torch.Tensor | None = None
-    over: torch.Tensor | None = None
     scroll: torch.Tensor | None = None
-    evidence: bool = False
 
     def to(self, device) -> Conditioning:
         return self._each(lambda part: part.to(device))
@@ -77,22 +75,6 @@ class Block(nn.Module):
     def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
         inner = F.silu(self.first(x) + self.context(context)[:, :, None, None])
         return F.silu(x + self.second(inner))
-
-
-def down_and_up(net: Any, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-    """Maps [B, C, h, w] through the levels of the U-Net `net`: its blocks `before` and `after`, its steps `down` and `up`. The maps
-    are laid out channels last, like its weights."""
-    x, kept = x.contiguous(memory_format=torch.channels_last), []
-    for level, block in enumerate(net.before):
-        x = block(x, context)
-        if level < len(net.down):
-            kept.append(x)
-            x = net.down[level](x)
-    x = net.after[-1](x, context)
-    for level in reversed(range(len(net.down))):
-        x = kept[level] + F.interpolate(net.up[level](x), kept[level].shape[-2:], mode="nearest")
-        x = net.after[level](x, context)
-    return x
 
 
 @final
@@ -152,7 +134,16 @@ class UNet(nn.Module):
             parts += [carried * (last_trust > 0), last[:, 5:]]
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
-        x = down_and_up(self, x, context)
+        x, kept = x.contiguous(memory_format=torch.channels_last), []  # like the weights
+        for level, block in enumerate(self.before):
+            x = block(x, context)
+            if level < len(self.down):
+                kept.append(x)
+                x = self.down[level](x)
+        x = self.after[-1](x, context)
+        for level in reversed(range(len(self.down))):
+            x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
+            x = self.after[level](x, context)
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # by default a thing stays as it was; what was not seen is not copied

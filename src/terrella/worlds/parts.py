@@ -130,7 +130,7 @@ class Scene(WorldPart, Protocol):
 
 @runtime_checkable
 class Generator(WorldPart, Protocol):
-    """Draws a frame: a UNet or a FlowNetwork by flow matching in config.steps steps, or the Codec in one pass."""
+    """Draws a frame by flow matching in config.steps steps: a UNet or a FlowNetwork."""
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """The conditioning, with what the generator itself derives from it once a frame."""

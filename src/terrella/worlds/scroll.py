@@ -1,7 +1,5 @@
 """Scroll: by which displacement most of a flat world's picture goes on."""
 
-from typing import Protocol
-
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -10,33 +8,21 @@ from ..space.matching import edge_shares
 from .generator import Conditioning
 
 
-class ScrollsConfig(Protocol):
-    """What the settings of generators that know scrolls have in common; see CodecConfig and FlowConfig."""
-
-    @property
-    def size(self) -> tuple[int, int]: ...
-    @property
-    def slots(self) -> int: ...
-    @property
-    def context(self) -> int: ...
-    @property
-    def moves(self) -> int: ...
-
-
 class Scroll(nn.Module):
-    """Predicts by which of the moves most of the picture scrolls next."""
+    """Predicts by which of `moves` + 1 moves most of the picture scrolls next, from the last `slots` frames and a context of
+    `context` numbers."""
 
-    def __init__(self, config: ScrollsConfig):
+    def __init__(self, size: tuple[int, int], slots: int, context: int, moves: int):
         super().__init__()
-        (height, width), moves = config.size, config.moves + 1
+        height, width = size
         self.glance = nn.Sequential(
             nn.AvgPool2d(2), nn.Conv2d(3, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 48, 2, stride=2), nn.SiLU(), nn.Flatten(),
             nn.Linear(48 * (height // 16) * (width // 16), 64), nn.SiLU(),
         )  # fmt: skip
-        self.known = nn.Linear(64 + config.context + (config.slots - 1) * moves, 128)
-        self.votes = nn.Linear(128, moves)
+        self.known = nn.Linear(64 + context + (slots - 1) * (moves + 1), 128)
+        self.votes = nn.Linear(128, moves + 1)
         nn.init.zeros_(self.votes.weight)
-        self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * config.moves))  # untrained, nothing scrolls
+        self.votes.bias = nn.Parameter(torch.tensor([4.0] + [0.0] * moves))  # untrained, nothing scrolls
 
     def frame_features(self, frame: torch.Tensor) -> torch.Tensor:
         """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
@@ -51,15 +37,10 @@ class Scroll(nn.Module):
 
 def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Tensor) -> torch.Tensor:
     """By which of the `moves` int64 [K, 2] most of the picture goes on: int64 [B]."""
-    frames = frames_of(conditioning)
+    frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)  # the newest first
     went = [edge_shares(one, other, moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
     logits = scroll(scroll.frame_features(frames[:, 0]), conditioning.context, torch.stack(went, 1))
     return least_off(logits, moves)
-
-
-def frames_of(conditioning: Conditioning) -> torch.Tensor:
-    """The last frames, uint8 [B, slots, 3, H, W], the newest first."""
-    return (conditioning.glimpse.rgb * 255).round().to(torch.uint8)
 
 
 def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:

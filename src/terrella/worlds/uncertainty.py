@@ -104,13 +104,7 @@ class UncertaintyNetwork(nn.Module):
         invented = torch.maximum(self.calibrated(cells.mean((1, 2))), self.invents * gone[:, 4])
         invented = torch.minimum(invented, self.ceiling)
         drifted = (self.ceiling - invented) * self.drifts(gone)
-        whole = invented + drifted
-        if conditioning.evidence:  # what comes from its mosaic is not invented
-            unknown = F.avg_pool2d(
-                1 - conditioning.glimpse.known[:, None], 2 * CELLS, ceil_mode=True, count_include_pad=False
-            )
-            invented = whole * (cells * unknown[:, 0]).sum((1, 2)) / cells.sum((1, 2))
-        return Expected(whole, whole - invented, invented)
+        return Expected(invented + drifted, drifted, invented)
 
     def drifts(self, gone: torch.Tensor) -> torch.Tensor:
         """How much of the way to the ceiling the error of a frame is [B], by its steps, metres and radians since evidence."""

@@ -15,9 +15,7 @@ import torch
 from ...core.errors import DatasetError
 from ...worlds.generator import encode_depth
 from ...worlds.learned import LearnedWorld
-from ...worlds.parts import newest_frame
 from ..batches import Batch, as_generated, encode_rgb
-from ..history_batches import change_weight
 from ..recording import Recording
 from ..trainer import Loss, TrainStep
 from .distillation import Student
@@ -29,9 +27,9 @@ class DreamRollouts:
     """`batch` rollouts that follow recorded rows: the inputs of the generator at each step, and the recorded frame."""
 
     def __init__(self, world: LearnedWorld, recording: Recording, horizon: int, batch: int, now: TrainStep):
-        """A world with a memory rolls out every other batch without it: there most must be invented."""
+        """Every other batch is rolled out without a memory: there most must be invented."""
         self.recording, self.world, self.config = recording, world, world.config
-        if self.config.geometry and now.rng.random() < 0.5:
+        if now.rng.random() < 0.5:
             self.world = world.without_memory()
         rows = now.rng.choice(dream_starts(recording, horizon), batch)
         self.row = rows - CONTEXT + 1
@@ -49,16 +47,9 @@ class DreamRollouts:
         self.row = self.row + 1
         target, weight = recording.rgb(self.row), None
         numbers = recording.action(self.row - 1).to(device)
-        pose = recording.pose(self.row).to(device) if self.config.geometry else None
-        self.state, self.after = world.move(self.state, numbers, pose)
+        self.state, self.after = world.move(self.state, numbers, recording.pose(self.row).to(device))
         self.shown = world.look(self.after, self.state)
-        if self.config.geometry:
-            depth = recording.depth(self.row)
-        else:
-            depth = self.shown.glimpse.depth.cpu()
-            newest = newest_frame(self.state).cpu()
-            weight = change_weight(target, torch.stack([newest, recording.rgb(self.row - 1)], 1))
-        truth = torch.cat([encode_rgb(target), encode_depth(depth)[:, None]], 1)
+        truth = torch.cat([encode_rgb(target), encode_depth(recording.depth(self.row))[:, None]], 1)
         if self.config.moving:
             truth = torch.cat([truth, recording.things(self.row)[:, None]], 1)
         if self.config.objects:

@@ -17,7 +17,6 @@ from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
 from ...worlds.uncertainty import UncertaintyNetwork, UncertaintyProbe, input_maps, placed, situation_of
 from ..recording import Recording
-from .stress import observed, steps_ahead
 
 LONGEST = 1000  # steps of a rollout
 LOOKS = 64  # steps of it whose frames are compared
@@ -48,7 +47,7 @@ def ceiling_of(recording: Recording, seed: int) -> float:
 def drift_horizon(recording: Recording, frames: int) -> int:
     """Steps of the rollouts, for the number of frames that an uncertainty is learned from: the longest that a fifth of the rows
     allow."""
-    ahead = steps_ahead(recording)
+    ahead = recording.steps_ahead()
     typical = int(np.quantile(ahead[ahead > 0], 0.8)) if (ahead > 0).any() else 0
     return min(LONGEST, max(8, frames // 4), max(0, typical - SHOWN))
 
@@ -75,9 +74,12 @@ def drift_frames(
     dreamer = world.replaced(uncertainty=UncertaintyProbe(note))
     rng, parts, half = np.random.default_rng([seed, 14]), [], LOOKS // 2
     looks = {*np.geomspace(1, horizon, half).astype(int), *np.linspace(1, horizon, half).astype(int)}
-    begins = rng.choice(np.flatnonzero(steps_ahead(recording) >= SHOWN + horizon), rollouts)
+    begins = rng.choice(np.flatnonzero(recording.steps_ahead() >= SHOWN + horizon), rollouts)
     chance = make_rng(int(rng.integers(2**62)))
-    state = observed(dreamer, recording, begins, SHOWN, chance)
+    state = dreamer.observe(recording.evidence(dreamer.config, begins), None, chance)
+    for row in range(1, SHOWN):
+        state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, begins + row - 1), chance)
+        state = dreamer.observe(recording.evidence(dreamer.config, begins + row), state, chance)
     for step in range(1, horizon + 1):
         rows = begins + SHOWN - 1 + step
         state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)

@@ -15,7 +15,6 @@ from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..moves import StitchedEpisodes
 from ..muon import muon
 from ..trainer import Ema, Loss, TrainStep, warmup_cosine
-from .codec import Spans
 
 NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
 CHANGED = 8  # difference of 255 by which a pixel changes
@@ -84,12 +83,12 @@ class FlowFrames:
     """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise, and later also at a
     random t. Pictures are carried along by the true scroll. stress: the additional weight of pixels that change otherwise."""
 
-    def __init__(self, network: FlowNetwork, learning_rate: float, spans: Spans, stress: float):
-        self.stress, self.spans, self.losses_per_batch = stress, spans, spans.rollout  # gradient steps per batch
+    def __init__(self, network: FlowNetwork, learning_rate: float, rollout: int, stress: float):
+        self.stress, self.losses_per_batch = stress, rollout  # gradient steps per batch
         self.generator = channels_last(network)
         self.smooth = Ema(self.generator, 0.995)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
-        rate = warmup_cosine(learning_rate, WARMUP // spans.rollout, 0.02)
+        rate = warmup_cosine(learning_rate, WARMUP // rollout, 0.02)
         self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:

@@ -38,7 +38,6 @@ from ..recording import Recording
 from ..run_folder import resume_file
 from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
 from .drift import ROLLOUTS, ceiling_of, drift_frames, drift_horizon, fit_drift
-from .stress import steps_ahead
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"
 ARMS = (MEMORY, HOLES, NONE, HOLES, MEMORY, NONE, LONE)  # in turn
@@ -142,12 +141,6 @@ def uncertainty_seconds(world: LearnedWorld, recording: Recording, frames: int) 
     )
 
 
-def dreaming_seconds(world: LearnedWorld, recording: Recording, frames: int) -> float:
-    """Seconds of rollouts of `frames` frames, estimated from a few of them."""
-    horizon = _horizon(recording, frames)
-    return 0.0 if horizon < MIN_HORIZON else _dreamt_s(world, recording, horizon)[0] * frames
-
-
 def _dreamt_s(world: LearnedWorld, recording: Recording, horizon: int) -> tuple[float, DreamFrames]:
     """Seconds a frame of a rollout, and some frames."""
     trial = DreamSettings(0, 4, shown=(1,))
@@ -168,7 +161,7 @@ def discard_uncertainty(out: Path) -> None:
 def _horizon(recording: Recording, frames: int) -> int:
     """Steps of a rollout: as many as fit into the stretches that hold half of the recording's frames, so that rollouts do not
     all begin in its longest episode. Below MIN_HORIZON if none fits."""
-    ahead = steps_ahead(recording)
+    ahead = recording.steps_ahead()
     lengths = ahead[(ahead > 0) & (np.append(0, ahead[:-1]) != ahead + 1)]  # of the stretches, each from its first row
     lengths = np.sort(lengths[lengths >= max(SHOWN) + MIN_HORIZON])[::-1]
     if not len(lengths):
@@ -212,7 +205,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
         arm = NONE
     alone, horizon = arm == LONE, rollout.horizon
     shown = 1 if alone else int(rng.choice(rollout.shown))
-    begins = rng.choice(np.flatnonzero(steps_ahead(recording) >= shown + horizon), rollout.batch)
+    begins = rng.choice(np.flatnonzero(recording.steps_ahead() >= shown + horizon), rollout.batch)
     posed = not alone and world.config.geometry and not world.config.moving and rng.random() < 0.35
     inputs: list[tuple[torch.Tensor, torch.Tensor]] = []
 

@@ -10,7 +10,6 @@ import torch
 
 from ...core.errors import TrainingError
 from ...worlds.folder import save_world
-from ...worlds.generator import UNet
 from ...worlds.learned import LearnedWorld
 from ..feeds import RandomBatches
 from ..objectives.distillation import Student
@@ -59,7 +58,7 @@ class DreamsConfig(PostTraining):
 
 def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report) -> dict:
     """Trains, or resumes, the student in the folder `out`; its world is in `out`/world. Returns the facts of the run."""
-    name, steps = teacher.spec.name, teacher.config.steps
+    name, steps = check_posed(teacher).spec.name, teacher.config.steps
     if steps == 1:
         raise TrainingError(
             f"{name} draws a frame in one step already; a teacher comes from `terrella train video --flow-steps 8`."
@@ -76,7 +75,7 @@ def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: Dis
     )
     student = Student("student", teacher.generator, config.flow_steps, rate, 0.0, weights, teacher.generator)
     run = _run(pair, out, config, report)
-    trainer = Trainer(run, "distil", pair.feed(config.batch, config.seed, student.dream), student, config.steps)
+    trainer = Trainer(run, "distil", pair.feed(config.batch, student.dream), student, config.steps)
     about = f"{steps} to {config.flow_steps} steps a frame, {{}} updates"
     return _trained(pair, run, trainer, student, lambda step: {"distilled": about.format(step)})
 
@@ -95,13 +94,9 @@ def train_dreams(
     """
     if min(config.steps, config.horizon, config.batch) < 1:
         raise TrainingError("--steps, --horizon and --batch are 1 or more.")
-    if not isinstance(world.generator, UNet):
-        raise TrainingError(
-            f"{world.spec.name} was trained on its own rollouts already, as worlds without depth are: nothing is left to do here."
-        )
-    pair = open_paired(world, data, config.keep_out, report)
+    pair = open_paired(check_posed(world), data, config.keep_out, report)
     dream_starts(pair.recording, config.horizon)
-    more = {} if teacher is None else {"teacher": fingerprint(check_teacher(world, teacher).generator)}
+    more = {} if teacher is None else {"teacher": fingerprint(check_teacher(world, check_posed(teacher)).generator)}
     torch.manual_seed(config.seed)
     weights, rate = (
         (config.truth_weight, config.teacher_weight, config.critic_weight),
@@ -109,7 +104,7 @@ def train_dreams(
     )
     likely = None if teacher is None else teacher.generator
     student = Student("generator", world.generator, world.config.steps, rate, 0.9, weights, likely)
-    dreams = DreamsObjective(student, config.horizon, lambda now: pair.real(config.batch, now))
+    dreams = DreamsObjective(student, config.horizon, pair.feed(config.batch).batch)
     run = _run(pair, out, config, report, **more)
     feed = RandomBatches(lambda now: DreamRollouts(world, pair.recording, config.horizon, config.batch, now))
     trainer = Trainer(run, "dreams", feed, dreams, config.steps)
@@ -117,10 +112,20 @@ def train_dreams(
     return _trained(pair, run, trainer, student, about)
 
 
+def check_posed(world: LearnedWorld) -> LearnedWorld:
+    """The world; TrainingError for a flat one, which has learned from its own rollouts and samples its frames."""
+    if not world.config.geometry:
+        raise TrainingError(
+            f"{world.spec.name} has no depth and poses, and further training is for worlds that have; `terrella train video` with "
+            "more --hours trains it further."
+        )
+    return world
+
+
 def check_teacher(world: LearnedWorld, teacher: LearnedWorld) -> LearnedWorld:
     """The teacher; TrainingError unless its generator has the inputs of that of `world`."""
     configs = (world.generator.config, teacher.generator.config)
-    inputs = [(one.size, one.slots, one.context, getattr(one, "moving", None)) for one in configs]
+    inputs = [(one.size, one.slots, one.context, one.moving) for one in configs]
     if inputs[0] == inputs[1] and teacher.config.steps > 1:
         return teacher
     raise TrainingError(

@@ -21,13 +21,11 @@ from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
-from .video_flat import CodecRecipe, FlatFlowRecipe, FlowRecipe
+from .video_flat import FlowRecipe
 from .video_parts import VideoRecipe
 from .video_posed import PosedRecipe
 
 FEWEST_FRAMES = 200  # from which an uncertainty is learned
-TUNING = 0.06  # the part of the hours that tuning may take
-FLAT = {"codec": CodecRecipe, "flow": FlowRecipe}
 WHY = "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
 
 
@@ -59,7 +57,7 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
     with TemporaryDirectory() as folder:
         recipe = _recipe(data, folder, replace(config, hours=0.0), lambda *_: None)
         setup_s, trained = time.monotonic() - began, _Training(recipe)
-        rest = sum(stage.share or 0.0 for stage in trained.stages) + TUNING
+        rest = sum(stage.share or 0.0 for stage in trained.stages)
         many = torch.get_num_threads()
         counts = {many} if recipe.parts.run.device.type != "cpu" else {1, many}
         pace: dict[int, float] = {}
@@ -83,9 +81,7 @@ def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Repo
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
-    flat = FlatFlowRecipe if config.generator == "codec" and config.flow_steps > 1 else FLAT[config.generator]
-    make = PosedRecipe if video.geometry else flat
-    return make(run, recording, config, video)
+    return (PosedRecipe if video.geometry else FlowRecipe)(run, recording, config, video)
 
 
 class _Training:
@@ -144,39 +140,31 @@ class _Training:
             self.run.report(min(trainer.share, 1.0), 1.0, line)
 
     def _limit_s(self) -> float:
-        """Seconds of the generator's training: what the preparations left of the hours, less what tuning and uncertainty will
-        take by a trial. Where that is more than their parts of the hours, they make fewer rollouts: `shares` of the usual
-        number. A finished run stays finished until it is given more hours."""
+        """Seconds of the generator's training: what the preparations left of the hours, less what the uncertainty will take by a
+        trial. Where that is more than its part of the hours, it makes fewer rollouts: a `share` of the usual number. A finished run
+        stays finished until it is given more hours."""
         trainer, took_s = self.trainer, self.trainer.facts["seconds"]
         if self.config.hours <= trainer.facts.get("asked", 0.0):
             return took_s
-        budget, frames, world = self.run.budget, self.config.uncertainty_frames, self.recipe.world(trainer)
-        usual_s = {"tuning": self.recipe.tuning_s(world), "uncertainty": 0.0}
+        budget, frames, usual_s = self.run.budget, self.config.uncertainty_frames, 0.0
         if frames:
-            usual_s["uncertainty"] = 1.2 * uncertainty_seconds(world, self.parts.recording, frames)
-        most_s = {"tuning": TUNING * budget.seconds, "uncertainty": budget.most_s("uncertainty")}
-        shares = {name: min(1.0, most_s[name] / max(usual, 1e-6)) for name, usual in usual_s.items()}
-        trainer.facts["shares"] = shares
-        return max(1e-6, took_s + budget.left_s - sum(shares[name] * usual for name, usual in usual_s.items()))
+            usual_s = 1.2 * uncertainty_seconds(self.recipe.world(trainer), self.parts.recording, frames)
+        share = min(1.0, budget.most_s("uncertainty") / max(usual_s, 1e-6))
+        trainer.facts["share"] = share
+        return max(1e-6, took_s + budget.left_s - share * usual_s)
 
     def _finish(self) -> None:
-        """Tunes and saves the trained world, then gives it an estimator and an uncertainty."""
+        """Saves the trained world, which can then be played, and gives it an estimator and an uncertainty."""
         trainer, config = self.trainer, self.config
         if "senses" in trainer.facts and (self.run.out / "world" / "world.json").exists():
             return
         trainer.facts["asked"] = config.hours
         trainer.save()
-        save_world(
-            self.recipe.world(trainer), self.run.out / "world"
-        )  # playable, should a kill come before the rest is done
-        shares = trainer.facts.get("shares", {"tuning": 1.0, "uncertainty": 1.0})
-        tuned = self.recipe.tune(self.recipe.world(trainer), shares["tuning"])
         world = self._save_with_strip()
-        frames = int(shares["uncertainty"] * config.uncertainty_frames)
+        frames = int(trainer.facts.get("share", 1.0) * config.uncertainty_frames)
         fewest = min(FEWEST_FRAMES, config.uncertainty_frames)
         settings = SensesConfig(config.estimator_steps, frames if frames >= fewest else 0, config.seed)
         sensing, facts = learn_senses(self.run, world, self.parts.recording, config.keep_out, settings)
-        facts |= tuned
         save_world(sensing.replaced(card=facts), self.run.out / "world")
         trainer.compute_once("senses", lambda: facts)
 

@@ -1,7 +1,6 @@
 """Settings of `train video`, and the kind of world that a recording allows."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from ...core.errors import DatasetError
 from ...worlds.config import VideoConfig
@@ -20,11 +19,9 @@ class TrainConfig:
     size: tuple[int, int] | None = None
     # --no-geometry: learn from frames and actions alone, although the recording has depth and poses.
     geometry: bool = True
-    # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8, ...). Default: 32 56 88 128, and
-    # without depth 48 64 96.
+    # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8 and 1/16). Default: 32 56 88 128, and
+    # without depth 64 112 160.
     channels: tuple[int, ...] = ()
-    # How a world without geometry is drawn: codec fetches and paints pixels, flow draws samples of frames by a U-Net.
-    generator: Literal["codec", "flow"] = "codec"
     frames: int = 4  # Number of past frames that a world without geometry sees.
     # Training steps of the model that predicts reward, termination and vitals.
     outcome_steps: int = 1500
@@ -33,9 +30,8 @@ class TrainConfig:
     objects_steps: int = 2500
     # --no-moving: treat everything as static, although the recording marks what moves (monsters, doors, pick-ups).
     moving: bool = True
-    # Flow steps a frame (of `--generator flow` 3, unless more than 1 are given). With more than one the whole flow from noise to
-    # frame is learned, so that a frame is a sample, not a mean. A world of the default generator can then be the teacher of
-    # `train distil`.
+    # Flow steps a frame (without depth 3, unless more than 1 are given). With more than one the whole flow from noise to frame is
+    # learned, so that a frame is a sample, not a mean. A world with depth can then be the teacher of `train distil`.
     flow_steps: int = 1
     # Training steps of the generator. Training ends after these or after --hours, whichever comes first.
     steps: int = 8000
@@ -43,7 +39,7 @@ class TrainConfig:
     hours: float = 24.0
     # Frames per step. Default: 8 on a CPU, 64 on a GPU.
     batch: int | None = None
-    # Peak learning rate of the generator. Default: 8e-4, and without depth 2e-3 (flow: 6e-3).
+    # Peak learning rate of the generator. Default: 8e-4, and without depth 6e-3.
     learning_rate: float | None = None
     motion_steps: int = 6000  # Training steps of the motion model.
     keyframes: int = 640  # Number of recorded keyframes that the world keeps in memory.
@@ -81,7 +77,6 @@ def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:
         slots=3 if posed else config.frames,
         geometry=posed,
         steps=config.flow_steps,
-        residual=not posed and config.flow_steps == 1,
         moving=moving,
         objects=objects,
     )

@@ -12,11 +12,9 @@ from torch import nn
 
 from ...worlds.config import VideoConfig
 from ...worlds.folder import with_saved_keys
-from ...worlds.generator import UNet
 from ...worlds.learned import About, LearnedWorld
 from ...worlds.outcome import ConstantConfig, ConstantOutcome, FrameOutcome
 from ..budget import Stage
-from ..objectives.codec import CodecObjective
 from ..objectives.flow import Flow
 from ..objectives.flow_frames import FlowFrames
 from ..objectives.outcome import Happenings, OutcomeObjective, learn_outcome
@@ -28,24 +26,16 @@ from .video_config import TrainConfig
 class VideoRecipe(Protocol):
     """What differs between worlds with depth and poses and worlds of frames alone.
 
-    preparations: the stages before the generator. world: a copy, on the CPU, of the world as it now is. tune: sets what is chosen
-    by a `share` of the usual rollouts of the trained world, and returns facts; tuning_s: seconds of the usual ones, by a trial.
+    preparations: the stages before the generator. world: a copy, on the CPU, of the world as it now is.
     """
 
     @property
     def parts(self) -> VideoParts: ...
     @property
-    def objective(self) -> Flow | CodecObjective | FlowFrames: ...
+    def objective(self) -> Flow | FlowFrames: ...
     def feed(self, batch: int) -> Feed: ...
     def preparations(self) -> Sequence[Stage]: ...
     def world(self, trainer: Trainer) -> LearnedWorld: ...
-    def tuning_s(self, world: LearnedWorld) -> float: ...
-    def tune(self, world: LearnedWorld, share: float) -> dict: ...
-
-
-def flow_objective(video: VideoConfig, config: TrainConfig) -> Flow:
-    rate = config.learning_rate or 8e-4
-    return Flow(UNet(video.generator), config.flow_steps, rate, config.critic_from, config.critic_weight)
 
 
 class VideoParts:

@@ -7,19 +7,21 @@ import numpy as np
 
 from ...worlds.body import Motion, MotionBody
 from ...worlds.config import VideoConfig
+from ...worlds.generator import UNet
 from ...worlds.keyframe_scene import KeyframeScene
 from ...worlds.learned import LearnedWorld
 from ...worlds.objects import STARTS, Billboards, BillboardsConfig
 from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
-from ..feeds import frames_feed
+from ..feeds import place_feed
 from ..objectives.estimator import learn_estimator
+from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
 from ..recording import Recording, choose_keyframes, open_views
 from ..trainer import Feed, Run, Trainer
 from .video_config import TrainConfig
-from .video_parts import VideoParts, flow_objective
+from .video_parts import VideoParts
 
 
 class PosedRecipe:
@@ -35,12 +37,13 @@ class PosedRecipe:
         rows = np.flatnonzero(recording.usable)
         picks = choose_keyframes(np.asarray(recording.cache.pose), rows, config.keyframes)
         self.memory = recording.sharp_keyframes(picks, self.video.camera)
-        self.objective = flow_objective(self.video, config)
+        critic, rate = (config.critic_from, config.critic_weight), config.learning_rate or 8e-4
+        self.objective = Flow(UNet(self.video.generator), config.flow_steps, rate, *critic)
         self.motion = Motion(self.video.motion)
 
     def feed(self, batch: int) -> Feed:
         dream = self.objective.dream if self.video.steps == 1 else None  # a teacher sees recorded frames alone
-        return frames_feed(self.parts.recording, self.memory, self.video, batch, self.parts.config.seed, dream)
+        return place_feed(self.parts.recording, self.memory, self.video, batch, dream)
 
     def preparations(self) -> list[Stage]:
         stages = [Stage("motion", 0.08, self._learn_motion), *self.parts.outcome_stages()]
@@ -83,12 +86,6 @@ class PosedRecipe:
             objects=copy.deepcopy(self.objects),
             outcome=parts.trained_outcome(ConstantConfig(usual, terminal)),
         )
-
-    def tuning_s(self, world: LearnedWorld) -> float:
-        return 0.0
-
-    def tune(self, world: LearnedWorld, share: float) -> dict:
-        return {}
 
     def _first_rows(self) -> np.ndarray:
         """About STARTS first rows of episodes."""
