@@ -184,8 +184,9 @@ class Run:
     def saved_facts(self, stage: str) -> dict | None:
         """The facts of a stage that was begun; TrainingError if it had other settings, or another recording."""
         saved, recipe = load_run(resume_file(self.out, stage), {}, {}), json.loads(json.dumps(self.recipe))
-        old = recipe if saved is None else saved.get("recipe", {})
-        old = {name: value for name, value in old.items() if name not in RETIRED}
+        old = recipe
+        if saved is not None:
+            old = {name: value for name, value in saved.get("recipe", {}).items() if name not in RETIRED}
         both = {name: value for name, value in recipe.items() if name in old or name not in self.usual} | old
         other = [
             f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)
