@@ -4,7 +4,7 @@
 set -e
 PATH=.venv/bin:$PATH
 terrella record world gym:Islet-v0 --frames 20000 --seed 0 --out recordings/islet
-OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 1.9 --outcome-steps 400
+OMP_NUM_THREADS=1 terrella train video recordings/islet --out runs/islet --name islet --hours 1.2 --steps 20000 --outcome-steps 400
 mkdir -p src/terrella/bundled
 rm -rf src/terrella/bundled/islet
 cp -r runs/islet/world src/terrella/bundled/islet
