@@ -30,6 +30,7 @@ def test_no_example_is_forgotten_here():
         "03_two_cameras.py",
         "04_controllers.py",
         "05_robot.py",
+        "06_babyai.py",
     }
 
 
@@ -102,3 +103,8 @@ def test_an_instruction_names_posts_in_order():
     assert understood("Walk to the BLUE one, then to red!")["posts"].tolist() == [[2, 0]]
     with pytest.raises(terrella.core.errors.ContractError, match="no post"):
         understood("make tea")
+
+
+def test_the_bot_of_babyai_says_how_its_demonstrations_are_recorded():
+    made = example("06_babyai.py")
+    assert "--method imitation" in made["__doc__"] and callable(made["teacher"]) and "expert" in made
