@@ -28,7 +28,7 @@ from terrella.worlds.folder import load_world, save_world
 
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
-    "learn": "--action-names --adapter --device --fps --frames --idle --json --keys --minutes --out --practise "
+    "learn": "--action-names --adapter --device --fps --frames --idle --json --keys --minutes --out --policy --practise "
     "--randomise --seed --size --task",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "

@@ -13,16 +13,17 @@ import torch
 import torch.nn.functional as F
 
 from ..core.errors import DatasetError
-from ..core.spec import Spec
+from ..core.spec import Camera, Spec, kind_of
 from ..data import ClipCache, Dataset, split
-from ..data.training.cache import episodes_with, further_cameras
-from ..space.camera import Intrinsics, yaw
+from ..data.training.cache import array_for, episodes_with, further_cameras
+from ..space.camera import Intrinsics, relative_pose, yaw
 from ..space.floorplan import Box, horizon, sees_into
 from ..space.keyframes import Keyframes, doubled
 from ..space.reproject import least_around
 from ..worlds.carried_frames import covered_pixels, static_depth
 from ..worlds.config import VideoConfig
 from ..worlds.controls import AXES, CHOICE, Controls
+from ..worlds.frame_history import split_pictures
 from .trainer import Report
 
 THINGS = "observation.things"  # the mask of what may move or vanish
@@ -41,6 +42,9 @@ class Recording:
     controls: Controls | None = None  # the meaning of its actions; None: buttons
     dataset: Dataset | None = None  # its pictures at full size
     held_out: tuple[int, ...] = ()  # episodes for validation
+    cameras: tuple[
+        str, ...
+    ] = ()  # picture channels that lie side by side in `cache.rgb`, from the left; (): the main one alone
 
     @staticmethod
     def open(
@@ -51,16 +55,19 @@ class Recording:
         needs: tuple[str, ...] = ("rgb",),
         why: str = "a world of pictures is learned from them",
         cameras: Sequence[str] = (),
+        joined: Sequence[str] = (),
     ) -> Recording:
         """The recording `data`, a folder or an address, with pictures at `size` (height, width; None: see `fitted_size`). A clip
         cache of it is kept on this machine, for rows are read in random order. Every 20th episode is held out, and so are the
         rows in which something in the box `keep_out` is visible; episodes without a channel of `needs` are left out. cameras:
-        further pictures to keep, at the same size. DatasetError if it lacks a channel of `needs`, or rows."""
+        further pictures to keep, at the same size. joined: picture channels whose pictures of `size` are put side by side, from the
+        left, in the place of those of the main camera. DatasetError if it lacks a channel of `needs`, or rows."""
         dataset = data if isinstance(data, Dataset) else Dataset(data)
-        size = size or fitted_size(dataset)
+        size = size or fitted_size(dataset, len(joined) or 1)
         further = further_cameras(dataset, cameras)
         shown = lambda done, total: report(done, total, "building the clip cache")  # noqa: E731
-        cache = ClipCache.open(dataset, size, shown, further)
+        side_by_side = [dataset.feature(name) for name in joined]
+        cache = ClipCache.open(dataset, size, shown, further, joined=side_by_side)
         lacks = [name for name in needs if not has_channel(cache, name)]
         if lacks:
             raise DatasetError(f"{dataset.root} holds no {', '.join(lacks)}; {why}.")
@@ -68,7 +75,9 @@ class Recording:
             raise DatasetError(f"{dataset.root} has no poses, so no part of its map can be kept out; drop --keep-out.")
         train, held_out = split(len(cache.episodes))
         recording = Recording.of(cache, train, keep_out)
-        recording = replace(recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out))
+        recording = replace(
+            recording, controls=controls_of(cache), dataset=dataset, held_out=tuple(held_out), cameras=tuple(joined)
+        )
         return recording.having(needs)
 
     @staticmethod
@@ -112,9 +121,22 @@ class Recording:
 
     @property
     def ignored(self) -> tuple[str, ...]:
-        """Cameras of the recording that are not used: training uses the main one."""
+        """Cameras of the recording that are not used."""
         source = self.dataset
-        return () if source is None else tuple(name for name in source.cameras if name != source.rgb_key)
+        used = () if source is None else (source.rgb_key, *map(source.feature, self.cameras))
+        return () if source is None else tuple(name for name in source.cameras if name not in used)
+
+    def lenses(self) -> dict[str, Camera]:
+        """The cameras that are joined, mounted as their poses say relative to the main one; {} where that was not recorded."""
+        cache, known = self.cache, self.cache.world.get("cameras") or {}
+        names = {name: f"pose{name.removeprefix('rgb')}" for name in self.cameras if name in known}
+        arrays = {name: array_for(pose, cache.arrays, cache.keys) for name, pose in names.items()}
+        if not arrays or None in arrays.values() or "rgb" not in arrays:
+            return {}
+        poses = {name: torch.tensor(np.asarray(cache.arrays[array][0], np.float32)) for name, array in arrays.items()}
+        size = cache.rgb.shape[1], cache.rgb.shape[2] // len(self.cameras)
+        mounts = {name: tuple(relative_pose(poses["rgb"], pose).tolist()) for name, pose in poses.items()}
+        return {name: Camera(tuple(known[name]["intrinsics"]), size, None, mount) for name, mount in mounts.items()}
 
     @property
     def posed(self) -> bool:
@@ -194,7 +216,7 @@ class Recording:
 
     def evidence(self, config: VideoConfig, rows) -> dict[str, torch.Tensor]:
         """Observations of `rows` for a world of this config."""
-        seen = {"rgb": self.rgb(rows).permute(0, 2, 3, 1).contiguous()}
+        seen = dict(split_pictures(self.rgb(rows).permute(0, 2, 3, 1), self.cameras or ("rgb",)))
         if config.geometry:
             seen |= {"depth": self.depth(rows), "pose": self.pose(rows)}
         if config.moving:
@@ -228,9 +250,32 @@ def has_channel(cache: ClipCache, name: str) -> bool:
     return getattr(cache, name, None) is not None or name in cache.arrays
 
 
-def fitted_size(dataset: Dataset) -> tuple[int, int]:
-    """Height and width of a recording's frames in multiples of 8: their own, or scaled down to at most MOST pixels."""
-    return (96, 128) if dataset.rgb_key is None else learned_size(*dataset.sensors[dataset.rgb_key].shape[:2])
+def fitted_size(dataset: Dataset, cameras: int = 1) -> tuple[int, int]:
+    """Height and width of a recording's frames in multiples of 8: their own, or scaled down to at most MOST pixels of all cameras
+    together."""
+    if dataset.rgb_key is None:
+        return (96, 128)
+    height, width = dataset.sensors[dataset.rgb_key].shape[:2]
+    return learned_size(height, width, MOST // cameras)
+
+
+def joined_cameras(dataset: Dataset, geometry: bool = True) -> tuple[str, ...]:
+    """The picture channels of a recording that are learned as one wide picture: all, if their sizes are equal, from the left to the
+    right where their poses say which is where, the main one first otherwise. () for a single camera, and (with `geometry`) for
+    recordings with depth, whose main camera alone is learned."""
+    names = [name for name in dataset.channels if kind_of(name) == "rgb" and dataset.feature(name) in dataset.cameras]
+    sizes = {tuple(dataset.sensors[dataset.feature(name)].shape) for name in names}
+    if len(names) < 2 or len(sizes) > 1 or (geometry and dataset.has("depth") and dataset.has("pose")):
+        return ()
+    names.sort(key=lambda name: (name != "rgb", name))
+    poses = [f"pose{name.removeprefix('rgb')}" for name in names]
+    if not all(name in dataset.channels for name in poses):
+        return tuple(names)
+    shown = dataset.episode(0, [dataset.feature(name) for name in poses])
+    first = torch.tensor(np.stack([shown[dataset.feature(name)][0].ravel() for name in poses]), dtype=torch.float32)
+    turned = yaw(first) - yaw(first[:1])
+    to_left = torch.atan2(turned.sin(), turned.cos())
+    return tuple(names[at] for at in to_left.argsort(descending=True).tolist())
 
 
 def learned_size(height: int, width: int, most: int = MOST) -> tuple[int, int]:

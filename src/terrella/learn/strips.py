@@ -32,11 +32,11 @@ def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch
     things, under the recorded actions."""
     rng, config = make_rng(1), world.config
     state = world.observe(recording.evidence(config, rows[:1]), None, rng)
-    frames = [world.render(state, ("rgb",))["rgb"]]
+    frames = [world.frame(state)]
     for row in rows[1:]:
         if config.geometry and not config.moving:  # what moves depends on actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
             state = world.imagine(state, recording.recorded_actions(world.spec, [row - 1]), rng)
-        frames.append(world.render(state, ("rgb",))["rgb"])
-    return torch.cat(frames)[::8].permute(0, 3, 1, 2).cpu()
+        frames.append(world.frame(state))
+    return torch.cat(frames)[::8].cpu()

@@ -12,6 +12,7 @@ from .endurance import ENDURANCE, STILLNESS
 from .error_series import drift_probe
 from .exam import LONG, Exam, ExamResults, Probe, dreams
 from .outcomes import OUTCOMES
+from .overlap import OVERLAP
 from .page import page
 from .pixels import PIXELS
 from .pixels import series as pixel_series
@@ -26,7 +27,19 @@ from .verdict import to_json
 from .work_units import Calls, Clock, Forecast, Progress, Store, prices_of, run_all, writing
 
 DRIFT = drift_probe((pixel_series, state_series, pose_series))
-PROBES: tuple[Probe, ...] = (PIXELS, STATES, POSES, DRIFT, CALIBRATION, OUTCOMES, MEMORY, STILLNESS, ENDURANCE, SPEED)
+PROBES: tuple[Probe, ...] = (
+    PIXELS,
+    OVERLAP,
+    STATES,
+    POSES,
+    DRIFT,
+    CALIBRATION,
+    OUTCOMES,
+    MEMORY,
+    STILLNESS,
+    ENDURANCE,
+    SPEED,
+)
 
 
 @torch.inference_mode()

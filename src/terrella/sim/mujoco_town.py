@@ -48,6 +48,10 @@ def build_town(spec: mujoco.MjSpec, roads: RoadNetwork, seed: int) -> None:
     spec.stat.extent, spec.stat.center = 5.0, [0, 0, 0]
     spec.visual.quality.numquads = 1  # of a face of a box: all are flat
     spec.add_material(name="dull", specular=0, shininess=0)
+    sun, light = spec.worldbody.lights[0], spec.visual.headlight
+    sun.dir, sun.diffuse, sun.specular = [0.5, 0.35, -0.8], [0.6] * 3, [0] * 3
+    # a headlight goes with the camera: a wall would not look the same from each
+    light.ambient, light.diffuse, light.specular = [0.5] * 3, [0] * 3, [0] * 3
     _pave(world, roads)
     for street in range(len(roads.streets)):
         for sign in SIGNS:

@@ -65,6 +65,15 @@ def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tup
     return middle - focal * local[..., 1:] / depth.clamp_min(1e-4)[..., None], depth
 
 
+def relative_pose(body: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:
+    """T_body_cam [..., 7] of T_world_body and T_world_cam [..., 7]."""
+    place = ((camera[..., :3] - body[..., :3])[..., None, :] @ rotation(body))[..., 0, :]
+    w, axis, turned, toward = body[..., 3:4], -body[..., 4:], camera[..., 3:4], camera[..., 4:]
+    real = w * turned - (axis * toward).sum(-1, keepdim=True)
+    turn = torch.cat([real, w * toward + turned * axis + torch.linalg.cross(axis, toward)], -1)
+    return torch.cat([place, turn / turn.norm(dim=-1, keepdim=True)], -1)
+
+
 def yaw(pose: torch.Tensor) -> torch.Tensor:
     """Heading in radians, counter-clockwise from world x: [..., 7] -> [...]."""
     w, x, y, z = pose[..., 3:].unbind(-1)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ..act.policies_by_name import policy_of
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
 from ..data import Dataset, RecordOptions
@@ -51,6 +52,8 @@ class LearnConfig:
     out: Path | None = None
     """Folder for the recording, the run and the score; default: learned/ and the environment's name."""
     frames: int = 20_000  # Frames to record at most; recording ends sooner after an eighth of the time.
+    policy: str | None = None
+    """Who plays while it records, as for `record world`; default: a script that explores."""
     seed: int = 0  # The same seed gives the same result.
     device: Device = "auto"
     controls: ControlsConfig = ControlsConfig()
@@ -98,6 +101,7 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     device_of(config.device)
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed}
     settings |= asdict(config.environment) | asdict(config.controls)
+    settings |= {"policy": config.policy} if config.policy else {}
     schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes)
     if SCORING in schedule.facts:
         progress(f"{schedule.folder} is finished; --minutes with more than {schedule.minutes:g} trains it further.")
@@ -222,7 +226,8 @@ class _Learning:
             return schedule.left_s(RECORDING) <= 0 and overtime_s() <= 0
 
         options = RecordOptions(max_episode_steps=schedule.facts["longest"], pictures=storage_of(world.spec))
-        explore(world, out, frames, self.config.seed, counted, options, enough=enough)
+        policy = policy_of(self.config.policy, world.spec, world) if self.config.policy else None
+        explore(world, out, frames, self.config.seed, counted, options, policy, enough)
         dataset = Dataset(out)
         if dataset.length < min(FEWEST_FRAMES, frames):
             raise DatasetError(

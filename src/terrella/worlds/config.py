@@ -53,6 +53,7 @@ class HistoryConfig:
     slots: int  # last frames that are kept
     actions: int  # numbers of an encoded action
     moves: tuple[tuple[int, int], ...] = ()  # x and y in pixels by which pictures scroll, (0, 0) first; none: no mosaic
+    cameras: tuple[str, ...] = ()  # picture channels that lie side by side in a frame, from the left; (): rgb alone
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,9 @@ class VideoConfig:
     residual: bool = False  # a frame is the newest one and its change, without mixture and noise
     objects: bool = False  # things are billboards (worlds/objects.py), which the generator neither sees nor draws
     moving: bool = False  # things move: the generator sees the last two frames, and memory keeps what stands still
+    cameras: tuple[
+        str, ...
+    ] = ()  # of a frames-only world: picture channels side by side in a frame, from the left; (): rgb alone
 
     @property
     def generator(self) -> GeneratorConfig:
@@ -99,4 +103,4 @@ class VideoConfig:
     @property
     def frames(self) -> HistoryConfig:
         """Of the scene of a frames-only world."""
-        return HistoryConfig(self.size, self.slots, self.actions)
+        return HistoryConfig(self.size, self.slots, self.actions, cameras=self.cameras)

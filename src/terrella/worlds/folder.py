@@ -19,7 +19,7 @@ from torch import nn
 
 from ..core.errors import CheckpointError
 from ..core.files import remedy_of
-from ..core.spec import Spec
+from ..core.spec import Camera, Spec
 from ..space.estimator import Estimator, EstimatorConfig, half_weights, load_weights
 from ..space.keyframes import Keyframes
 from . import splat_folder
@@ -98,6 +98,7 @@ def _described(kind: str, version: int, about: About, parts: Mapping[str, Any]) 
             "controls": asdict(about.controls), "dt_s": about.dt_s, "action_names": list(about.action_names),
             "keys": dict(about.keys), "ignored": list(about.ignored), "idle": list(about.idle),
             "max_episode_steps": about.max_episode_steps,
+            "cameras": {name: asdict(camera) for name, camera in about.cameras.items()},
         },
         "parts": dict(parts),
         "card": dict(about.card),
@@ -207,6 +208,7 @@ def _about(world: dict) -> About:
         ignored=tuple(about["ignored"]),
         idle=tuple(about.get("idle", ())),
         max_episode_steps=about.get("max_episode_steps"),
+        cameras={name: _settings(Camera, facts) for name, facts in about.get("cameras", {}).items()},
     )
 
 

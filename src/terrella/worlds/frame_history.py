@@ -64,6 +64,7 @@ class FrameHistory:
     ):
         self.config, self.starts = config, starts
         self.device, self.history = starts.frames.device, config.slots
+        self.cameras = tuple(config.cameras) or ("rgb",)
         self.over = torch.zeros(config.size, dtype=torch.bool, device=self.device) if over is None else over
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
         self.ground = torch.zeros(4, 1, 1, dtype=torch.uint8, device=self.device) if ground is None else ground
@@ -82,11 +83,17 @@ class FrameHistory:
         return self
 
     def channels(self) -> Channels:
-        shows: dict[str, spaces.Space] = {"rgb": spaces.Box(0, 255, (*self.config.size, 3), np.uint8)}
+        one = spaces.Box(0, 255, (*self._picture_size, 3), np.uint8)
+        shows: dict[str, spaces.Space] = dict.fromkeys(self.cameras, one)
         if self.config.moves:
             height, width = (times * length for times, length in zip(PICTURES, self.config.size))
             shows["mosaic"] = spaces.Box(0, 255, (height, width, 4), np.uint8)
-        return Channels(shows, observes=("rgb",))
+        return Channels(shows, observes=self.cameras)
+
+    @property
+    def _picture_size(self) -> tuple[int, int]:
+        """Height and width of a camera's pictures."""
+        return self.config.size[0], self.config.size[1] // len(self.cameras)
 
     # -- evidence -----------------------------------------------------------------------------------------------------
 
@@ -101,9 +108,10 @@ class FrameHistory:
 
     def evidence(self, observation: Mapping[str, torch.Tensor], prior: State | None, estimator: Any) -> Evidence:
         """A picture replaces the newest frame of the prior; without a prior it stands for the whole history."""
-        if "rgb" not in observation:
-            raise ObservationError(f"it observes rgb; got {list(observation)}.")
-        frame = picture_of(observation, self.config.size, self.device)[:, None]
+        if not all(name in observation for name in self.cameras):
+            raise ObservationError(f"it observes {' and '.join(self.cameras)}; got {list(observation)}.")
+        pictures = [picture_of(observation, self._picture_size, self.device, name) for name in self.cameras]
+        frame = torch.cat(pictures, 3)[:, None]
         if prior is None:
             return Evidence(len(frame), self.device, None, {"frames": frame.repeat(1, self.config.slots, 1, 1, 1)})
         check_prior(prior.batch, len(frame))
@@ -179,11 +187,16 @@ class FrameHistory:
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         shown = {}
-        if "rgb" in channels:
-            shown["rgb"] = newest_frame(state).permute(0, 2, 3, 1).contiguous()
+        if set(self.cameras) & set(channels):
+            shown |= split_pictures(newest_frame(state).permute(0, 2, 3, 1), self.cameras)
         if "mosaic" in channels:
             shown["mosaic"] = _shown(self._whole(state))
         return shown
+
+
+def split_pictures(frames: torch.Tensor, cameras: Sequence[str]) -> Tensors:
+    """The pictures [B, H, W / n, 3] of n cameras, which lie side by side in frames [B, H, W, 3]."""
+    return {name: part.contiguous() for name, part in zip(cameras, frames.chunk(len(cameras), 2))}
 
 
 def _shown(mosaic: torch.Tensor) -> torch.Tensor:

@@ -49,6 +49,9 @@ class About:
     ignored: tuple[str, ...] = ()  # channels of the recording that were not learned
     idle: tuple[float, ...] = ()
     max_episode_steps: int | None = None
+    cameras: Mapping[str, Camera] = field(
+        default_factory=dict
+    )  # of frames without a scene in space, where they are known
 
 
 @final
@@ -99,6 +102,15 @@ class LearnedWorld:
     def memory(self) -> Keyframes:
         """The recordings' keyframes."""
         return self.scene.recorded
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The picture channels that lie side by side in its frames, from the left."""
+        return tuple(getattr(self.scene.config, "cameras", ())) or ("rgb",)
+
+    def frame(self, state: State) -> torch.Tensor:
+        """The whole frame of a state, its cameras' pictures side by side: uint8 [B, 3, H, W]."""
+        return torch.cat(list(self.render(state, self.cameras).values()), 2).permute(0, 3, 1, 2).contiguous()
 
     @property
     def starts(self) -> Keyframes | StartClips:
@@ -174,7 +186,7 @@ class LearnedWorld:
             keys=about.keys,
             idle=about.idle,
             max_episode_steps=about.max_episode_steps,
-            cameras={"rgb": Camera(scene.camera, self.size)} if scene.camera else {},
+            cameras={"rgb": Camera(scene.camera, self.size)} if scene.camera else about.cameras,
             action_units=about.controls.units,
             action_mode=about.controls.mode,
             action_frame=about.controls.frame,

@@ -219,12 +219,14 @@ def newest_frame(state: State) -> torch.Tensor:
     return state["rgb"] if "rgb" in state else state["frames"][:, 0]
 
 
-def picture_of(observation: Mapping[str, torch.Tensor], size: tuple[int, int], device) -> torch.Tensor:
-    """The rgb of an observation as uint8 [B, 3, H, W]; ObservationError for another type or size."""
-    rgb = torch.as_tensor(observation["rgb"])
+def picture_of(
+    observation: Mapping[str, torch.Tensor], size: tuple[int, int], device, name: str = "rgb"
+) -> torch.Tensor:
+    """A picture channel of an observation as uint8 [B, 3, H, W]; ObservationError for another type or size."""
+    rgb = torch.as_tensor(observation[name])
     if rgb.ndim != 4 or rgb.shape[1:] != (*size, 3) or rgb.dtype != torch.uint8:
         raise ObservationError(
-            f"rgb is uint8 [B, {size[0]}, {size[1]}, 3], 0 to 255; got {rgb.dtype} {tuple(rgb.shape)}."
+            f"{name} is uint8 [B, {size[0]}, {size[1]}, 3], 0 to 255; got {rgb.dtype} {tuple(rgb.shape)}."
         )
     return rgb.to(device).permute(0, 3, 1, 2).contiguous()
 

@@ -97,10 +97,13 @@ class ClipCache:
         progress: Callable[[int, int], None] | None = None,
         cameras: Sequence[str] = (),
         budget_bytes: int = BUDGET_BYTES,
+        joined: Sequence[str] = (),
     ) -> ClipCache:
         """The cache of `dataset` with pictures of `size` (height, width), built if it is missing or out of date.
 
         cameras:      features of further cameras to keep, at the same size, in `arrays`.
+        joined:       features of cameras whose pictures of `size` lie side by side in `rgb`, from the left, in the place of the
+                      main camera's.
         progress:     `progress(done, total)` counts episodes.
         budget_bytes: most bytes of the cache of a remote recording.
 
@@ -112,6 +115,7 @@ class ClipCache:
             raise DatasetError(f"{dataset.root} has no finished episode yet; record some first.")
         shelf, cameras = _shelf(dataset), sorted(set(cameras))
         more = "".join(f"+{hashlib.sha256(name.encode()).hexdigest()[:8]}" for name in cameras)
+        more += f"-{hashlib.sha256('|'.join(joined).encode()).hexdigest()[:8]}" if joined else ""
         kind = f"{size[0]}x{size[1]}{more}"
         path = shelf / f"{kind}-{_key(dataset, size)}"
         if path.is_dir():
@@ -122,7 +126,7 @@ class ClipCache:
                 for old in [*shelf.glob(f"{kind}-*"), *shelf.glob(".building*")]:
                     shutil.rmtree(old, ignore_errors=True)
                 try:
-                    _build(dataset, size, cameras, path, budget_bytes, progress)
+                    _build(dataset, size, cameras, joined, path, budget_bytes, progress)
                 except OSError as error:
                     raise DatasetError(f"cannot build the cache {path} ({error}); {files.remedy_of(error)}.") from error
                 finally:
@@ -203,10 +207,20 @@ def _shelf(dataset: Dataset) -> Path:
     raise DatasetError(f"no cache can be written in {tried}; set XDG_CACHE_HOME to a folder that can.")
 
 
-def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path: Path, budget: int, progress) -> None:
+def _build(
+    dataset: Dataset,
+    size: tuple[int, int],
+    cameras: Sequence[str],
+    joined: Sequence[str],
+    path: Path,
+    budget: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
     staged, near = path.parent / ".building", isinstance(dataset.files, LocalFiles)
     staged.mkdir()
-    kinds = kinds_of(dataset, size, cameras)
+    kinds = dict(kinds_of(dataset, size, cameras))
+    if joined:
+        kinds["rgb"] = np.dtype(np.uint8), (size[0], len(joined) * size[1], 3)
     need, free = bytes_a_row(kinds) * dataset.length, shutil.disk_usage(staged).free
     if need > free:
         raise DatasetError(
@@ -217,11 +231,14 @@ def _build(dataset: Dataset, size: tuple[int, int], cameras: Sequence[str], path
             f"the cache of {dataset.files} needs {need / 1e9:.2g} GB and {budget / 1e9:.2g} GB may be kept here: allow more, "
             "ask for smaller pictures, or read it in windows with Clips."
         )
-    arrays = new_arrays(staged, kinds, dataset.length)
+    arrays = filled = new_arrays(staged, kinds, dataset.length)
+    if joined:
+        parts = np.split(arrays["rgb"], len(joined), 2)  # views
+        filled = {name: array for name, array in arrays.items() if name != "rgb"} | dict(zip(joined, parts))
 
     def fill(number: int) -> None:
         with dataset.files.holding(*(() if near else dataset.episodes[number].files)):
-            fill_episode(dataset, number, size, arrays)
+            fill_episode(dataset, number, size, filled)
 
     workers = os.cpu_count() or 1  # decoding and resizing release the interpreter lock
     with ThreadPoolExecutor(workers if near else min(workers, _FETCHING)) as pool:

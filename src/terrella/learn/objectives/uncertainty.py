@@ -214,7 +214,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
 
     def evidence(rows: np.ndarray) -> Observation:
         seen = recording.evidence(world.config, rows)
-        return {"rgb": seen["rgb"]} if alone else seen
+        return {name: seen[name] for name in world.cameras} if alone else seen
 
     dreamer = _remembering(world, recording, begins, horizon, arm, rng).replaced(uncertainty=UncertaintyProbe(note))
     chance = make_rng(int(rng.integers(2**62)))
@@ -229,7 +229,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
             state = dreamer.observe({"pose": recording.pose(rows)}, state, chance)
         else:
             state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)
-        drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float() / 255
+        drawn = dreamer.frame(state).cpu().float() / 255
         maps, situation = inputs.pop()
         off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)
         cells = F.avg_pool2d(off, 2 * CELLS, ceil_mode=True, count_include_pad=False)

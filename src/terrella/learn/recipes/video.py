@@ -16,7 +16,7 @@ from ...worlds.folder import save_world
 from ...worlds.learned import LearnedWorld
 from ..budget import Stage
 from ..objectives.uncertainty import discard_uncertainty, uncertainty_seconds
-from ..recording import Recording
+from ..recording import Recording, joined_cameras
 from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer, device_named
 from .parts import SensesConfig, learn_senses
@@ -78,7 +78,8 @@ def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Repo
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
     run = Run.of(out, config, report, device, ("hours", "learning_rate"), **facts)
     run.saved_facts("flow")
-    recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY)
+    joined = joined_cameras(dataset, config.geometry)
+    recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY, joined=joined)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
     return (PosedRecipe if video.geometry else FlowRecipe)(run, recording, config, video)

@@ -79,4 +79,5 @@ def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:
         steps=config.flow_steps,
         moving=moving,
         objects=objects,
+        cameras=recording.cameras,
     )

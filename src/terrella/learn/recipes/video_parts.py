@@ -87,6 +87,7 @@ class VideoParts:
             ignored=recording.ignored,
             idle=tuple(kept.get("idle", ())),
             max_episode_steps=kept.get("max_episode_steps"),
+            cameras=recording.lenses(),
         )
 
     def _card(self, trainer: Trainer, modules: Sequence[nn.Module], keyframes: int) -> dict:
