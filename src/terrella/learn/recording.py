@@ -66,7 +66,7 @@ class Recording:
         size = size or fitted_size(dataset, len(joined) or 1)
         further = further_cameras(dataset, cameras)
         shown = lambda done, total: report(done, total, "building the clip cache")  # noqa: E731
-        side_by_side = [dataset.feature(name) for name in joined]
+        side_by_side = [dataset.feature(name) or name for name in joined]
         cache = ClipCache.open(dataset, size, shown, further, joined=side_by_side)
         lacks = [name for name in needs if not has_channel(cache, name)]
         if lacks:
@@ -263,16 +263,17 @@ def joined_cameras(dataset: Dataset, geometry: bool = True) -> tuple[str, ...]:
     """The picture channels of a recording that are learned as one wide picture: all, if their sizes are equal, from the left to the
     right where their poses say which is where, the main one first otherwise. () for a single camera, and (with `geometry`) for
     recordings with depth, whose main camera alone is learned."""
-    names = [name for name in dataset.channels if kind_of(name) == "rgb" and dataset.feature(name) in dataset.cameras]
-    sizes = {tuple(dataset.sensors[dataset.feature(name)].shape) for name in names}
+    known = {name: feature for name in dataset.channels if (feature := dataset.feature(name))}
+    names = [name for name, feature in known.items() if kind_of(name) == "rgb" and feature in dataset.cameras]
+    sizes = {tuple(dataset.sensors[known[name]].shape) for name in names}
     if len(names) < 2 or len(sizes) > 1 or (geometry and dataset.has("depth") and dataset.has("pose")):
         return ()
     names.sort(key=lambda name: (name != "rgb", name))
-    poses = [f"pose{name.removeprefix('rgb')}" for name in names]
-    if not all(name in dataset.channels for name in poses):
+    poses = [known.get(f"pose{name.removeprefix('rgb')}", "") for name in names]
+    if "" in poses:
         return tuple(names)
-    shown = dataset.episode(0, [dataset.feature(name) for name in poses])
-    first = torch.tensor(np.stack([shown[dataset.feature(name)][0].ravel() for name in poses]), dtype=torch.float32)
+    shown = dataset.episode(0, poses)
+    first = torch.tensor(np.stack([shown[name][0].ravel() for name in poses]), dtype=torch.float32)
     turned = yaw(first) - yaw(first[:1])
     to_left = torch.atan2(turned.sin(), turned.cos())
     return tuple(names[at] for at in to_left.argsort(descending=True).tolist())
