@@ -100,9 +100,7 @@ def test_pictures_lie_side_by_side_from_left_to_right(recorded):
 
 
 def test_a_world_of_three_cameras_is_learned_saved_and_plays(recorded, tmp_path):
-    config = TrainConfig(
-        generator="flow", steps=3, outcome_steps=2, uncertainty_frames=0, estimator_steps=0, batch=2, channels=(8, 8, 8)
-    )
+    config = TrainConfig(steps=3, outcome_steps=2, uncertainty_frames=0, estimator_steps=0, batch=2, channels=(8, 8, 8))
     train_video(recorded, tmp_path, config, quiet)
     world = load(tmp_path)
     check_world(world)
