@@ -131,9 +131,7 @@ def test_chunks_of_axes_go_either_of_two_ways_and_not_between():
     optimiser = objective.learners["imitation"].optimiser
     for step in range(250):
         way = torch.from_numpy(rng.choice([-0.8, 0.8], (128, 1, 1))).float().expand(128, 4, 1)
-        batch = Demonstrations(
-            {"observation": torch.zeros(128, 1)}, torch.zeros(128, 1, 1), way, torch.ones(128, 4, dtype=torch.bool)
-        )
+        batch = Demonstrations({"observation": torch.zeros(128, 1)}, torch.zeros(128, 1, 1), way, torch.ones(128, 4))
         now = TrainStep(step, step / 250, torch.device("cpu"), rng, make_rng(step))
         optimiser.param_groups[0]["lr"] = 3e-3
         loss = next(iter(objective.losses(batch, now))).value

@@ -34,7 +34,8 @@ COMMANDS = {
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
-    "train policy": ("train_policy:policy", "train a policy on imagined rollouts of a world"),
+    "train policy": ("train_policy:policy", "train a policy on imagined rollouts of a world, or by imitation"),
+    "train inverse": ("train_policy:inverse", "learn which actions clips show, from a few labelled episodes"),
     "train goals": ("train:goals", "train a policy that reaches goals in a latent world, without a search"),
     "train estimator": (
         "train:estimator",

@@ -1,12 +1,13 @@
-"""The command `terrella train policy`."""
+"""The commands `terrella train policy` and `train inverse`."""
 
 from typing import Annotated
 
 from tyro.conf import arg
 
+from ..workflows.inverse import InverseConfig, train_inverse
 from ..workflows.results import command
 from ..workflows.train_policy import TrainPolicyConfig, train_policy
-from .say import Json, say, show
+from .say import Json, RecordingName, say, show
 
 
 def policy(config: TrainPolicyConfig, world: Annotated[str | None, arg(name="in")] = None, json: Json = False) -> None:
@@ -20,3 +21,18 @@ def policy(config: TrainPolicyConfig, world: Annotated[str | None, arg(name="in"
     trained = train_policy(world, config, progress=say)
     played = world or config.real
     show(trained, json, command("terrella", "play", played, agent=trained.folder) if played else "")
+
+
+def inverse(data: RecordingName, config: InverseConfig, json: Json = False) -> None:
+    """Learn from a few labelled episodes which action lies between observations, and label the others, with a calibrated confidence
+    that weighs them in imitation. Stop it with Ctrl-C at any time; the same command continues.
+
+    Args:
+        data: The recording to label: a folder, or an address.
+    """
+    trained = train_inverse(data, config, progress=say)
+    recording, out = trained.facts.get("recording"), f"{config.out}/policy"
+    following = (
+        command("terrella", "train", "policy", method="imitation", out=out, **{"from": recording}) if recording else ""
+    )
+    show(trained, json, following)

@@ -14,6 +14,8 @@ from ..data.training.cache import array_for
 from .objectives.imitation import Demonstrations
 from .recording import Recording
 
+CONFIDENCE = "observation.action_confidence"  # of actions that a model named (train inverse)
+
 
 @dataclass(frozen=True)
 class DemonstrationRows:
@@ -23,10 +25,13 @@ class DemonstrationRows:
     config: ImitationConfig
     device: torch.device
     rows: np.ndarray  # that are sampled
+    valid: np.ndarray  # bool [R]: rows with an action
     stop: np.ndarray  # [R]: the end of each row's episode
     actions: torch.Tensor  # float32 [R, A], encoded
     words: torch.Tensor | None  # int64 [R, WORDS], the instruction of each row
     outcome: torch.Tensor | None  # float32 [R], the standardised return of each row's episode
+    weight: torch.Tensor | None = None  # float32 [R], of each row's action in the loss; None: 1
+    ahead: int = 0  # observations after the moment that are seen, too, as the last of the history
 
     @staticmethod
     def of(recording: Recording, config: ImitationConfig, device: torch.device) -> DemonstrationRows:
@@ -43,21 +48,30 @@ class DemonstrationRows:
         if config.vocabulary:
             texts = WordEncoder(config.vocabulary).read(cache.tasks)
             words = texts[torch.from_numpy(np.array(cache.arrays["task"]))]
-        actions = config.encode(torch.from_numpy(np.array(cache.action, np.float32)))
-        valid = np.asarray(cache.action_valid).reshape(-1)
-        rows = np.flatnonzero(recording.usable & valid)
+        if cache.action is None:  # clips: every row but an episode's last has an action that nobody recorded
+            actions, valid = torch.zeros(cache.length, config.action_width), np.arange(cache.length) < stop - 1
+        else:
+            actions = config.encode(torch.from_numpy(np.array(cache.action, np.float32)))
+            valid = np.array(cache.action_valid, bool).reshape(-1)
+        rows, sure = np.flatnonzero(recording.usable & valid), cache.arrays.get(CONFIDENCE)
         if not len(rows):
             raise DatasetError(f"{recording.name} holds no actions to imitate; record demonstrations.")
-        return DemonstrationRows(recording, config, device, rows, stop, actions, words, outcome)
+        weight = None if sure is None else torch.from_numpy(np.array(sure, np.float32).reshape(-1))
+        return DemonstrationRows(recording, config, device, rows, valid, stop, actions, words, outcome, weight)
 
     @property
     def held_out(self) -> DemonstrationRows:
         """The same of the held-out episodes; of all where none is held out."""
-        cache, rows = self.recording.cache, np.zeros(self.recording.cache.length, bool)
-        for number in self.recording.held_out:
-            rows[slice(*cache.episodes[number])] = True
-        rows &= np.asarray(cache.action_valid).reshape(-1)
-        return replace(self, rows=np.flatnonzero(rows)) if rows.any() else self
+        rows = self.of_episodes(np.array(self.recording.held_out, np.int64))
+        return rows if len(rows.rows) else self
+
+    def of_episodes(self, numbers: np.ndarray) -> DemonstrationRows:
+        """The same with only the rows of these episodes."""
+        cache = self.recording.cache
+        inside = np.zeros(cache.length, bool)
+        for number in numbers:
+            inside[slice(*cache.episodes[number])] = True
+        return replace(self, rows=np.flatnonzero(inside & self.valid))
 
     def sample(self, count: int, rng: np.random.Generator) -> Demonstrations:
         """`count` moments, drawn uniformly."""
@@ -66,19 +80,22 @@ class DemonstrationRows:
     def at(self, rows: np.ndarray) -> Demonstrations:
         """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero."""
         config, cache, start = self.config, self.recording.cache, self.recording.start[rows]
-        back = rows[:, None] - np.arange(config.history - 1, -1, -1)
-        shown = np.maximum(back, start[:, None]).ravel()
+        back = rows[:, None] + self.ahead - np.arange(config.history - 1, -1, -1)
+        shown = back.clip(start[:, None], self.stop[rows][:, None] - 1).ravel()
         seen = {}
         for name, _ in config.actor.sees:
             array = array_for(name, cache.arrays, cache.keys)
             assert array is not None
             seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][shown])).to(self.device)
-        before = torch.from_numpy(np.maximum(back - 1, start[:, None]))
+        before = torch.from_numpy((back - 1).clip(start[:, None], self.stop[rows][:, None] - 1))
         acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], self.actions[before], 0.0)
         ahead = rows[:, None] + np.arange(config.chunk)
         valid = torch.from_numpy(ahead < self.stop[rows][:, None])
         ahead = np.minimum(ahead, self.stop[rows][:, None] - 1)
-        valid &= torch.from_numpy(np.asarray(cache.action_valid).reshape(-1)[ahead])
+        valid &= torch.from_numpy(self.valid[ahead])
+        weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk, picked = self.actions[torch.from_numpy(ahead)], torch.from_numpy(rows)
         words, outcome = (None if each is None else each[picked].to(self.device) for each in (self.words, self.outcome))
-        return Demonstrations(seen, acted.to(self.device), chunk.to(self.device), valid.to(self.device), words, outcome)
+        return Demonstrations(
+            seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome
+        )

@@ -23,7 +23,7 @@ class Demonstrations:
     seen: Mapping[str, torch.Tensor]  # channel -> [N * history, ...], the oldest step of each moment first
     acted: torch.Tensor  # [N, history, A], the encoded actions before the moment
     chunk: torch.Tensor  # [N, chunk, A], the encoded actions from the moment on
-    valid: torch.Tensor  # bool [N, chunk]: within the episode
+    weight: torch.Tensor  # float32 [N, chunk] of each action in the loss, 0 beyond the episode
     words: torch.Tensor | None = None  # [N, WORDS], the instruction
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
 
@@ -31,10 +31,10 @@ class Demonstrations:
 class BehaviourCloning:
     """The chunk that the teacher took, from what it saw."""
 
-    def __init__(self, network: ImitationNetwork, learning_rate: float):
-        self.network = network
+    def __init__(self, network: ImitationNetwork, learning_rate: float, name: str = "imitation"):
+        self.network, self.name = network, name
         self.modules = {"network": network}
-        self.learners = {"imitation": adamw((network,), warmup_cosine(learning_rate, 100, 0.02), decay=1e-3)}
+        self.learners = {name: adamw((network,), warmup_cosine(learning_rate, 100, 0.02), decay=1e-3)}
 
     def losses(self, batch: Demonstrations, now: TrainStep) -> Iterator[Loss]:
         network, config, count = self.network, self.network.config, len(batch.chunk)
@@ -47,8 +47,8 @@ class BehaviourCloning:
             error = (network.flow(noisy, time, out) - (data - noise)).square().view(*batch.chunk.shape).mean(2)
         else:
             error = chunk_errors(network, out, batch.chunk)
-        loss = (error * batch.valid).sum() / batch.valid.sum()
-        yield Loss("imitation", loss, {"imitation": loss})
+        loss = (error * batch.weight).sum() / batch.weight.sum().clamp_min(1e-6)
+        yield Loss(self.name, loss, {self.name: loss})
 
 
 def condition(

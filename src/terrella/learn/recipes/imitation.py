@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,18 @@ from ..trainer import Report, Run, Trainer, device_named
 from .policy import DEFAULT_MINUTES, ENDLESS, Practice
 
 STAGE = "imitation"
-NOT_SEEN = {"action", "reward", "done", "truncated", "depth", "pose", "latent", "expert", *ESTIMATES}
+NOT_SEEN = {
+    "action",
+    "reward",
+    "done",
+    "truncated",
+    "depth",
+    "pose",
+    "latent",
+    "expert",
+    "action_confidence",
+    *ESTIMATES,
+}
 DISCRETE_CHUNK, AXES_CHUNK = 1, 8  # default chunk of actions
 TESTED = 2048  # moments of the final test
 
@@ -56,9 +67,11 @@ def train_imitation(
     imitation: Imitation,
     report: Report,
     device: str = "auto",
+    relabel: Callable[[DemonstrationRows], DemonstrationRows] = lambda rows: rows,
 ) -> dict[str, Any]:
     """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
-    verdict on held-out episodes. DatasetError or TrainingError for what cannot be imitated."""
+    verdict on held-out episodes. relabel: which rows are learned from, with what actions. DatasetError or TrainingError for what
+    cannot be imitated."""
     out, batch = Path(out), practice.batch or 256
     _check(practice, imitation)
     opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
@@ -67,7 +80,7 @@ def train_imitation(
     run.saved_facts(STAGE)
     torch.manual_seed(practice.seed)
     network = ImitationNetwork(config_of(opened, sees, practice.hidden, imitation)).to(run.device)
-    rows = DemonstrationRows.of(opened, network.config, run.device)
+    rows = relabel(DemonstrationRows.of(opened, network.config, run.device))
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
     objective = BehaviourCloning(network, practice.learning_rate)
     feed = RandomBatches(lambda now: rows.sample(batch, now.rng))
@@ -87,14 +100,17 @@ def train_imitation(
 
 
 def open_demonstrations(
-    recording: str | Path, sees: Sequence[str], size: tuple[int, int], report: Report
+    recording: str | Path,
+    sees: Sequence[str],
+    size: tuple[int, int],
+    report: Report,
+    needs: tuple[str, ...] = ("action",),
 ) -> tuple[Recording, tuple[str, ...]]:
     """The recording, and the channels that a policy sees of it: these, or by default all cameras, codes and numbers."""
     dataset = Dataset(recording)
     cameras = [name for name in (sees or dataset.channels) if dataset.feature(name) in dataset.cameras]
-    opened = Recording.open(
-        dataset, size, report, needs=("action",), why="a policy imitates the actions of a recording", cameras=cameras
-    ).require_rows()
+    why = "a policy imitates the actions of a recording"
+    opened = Recording.open(dataset, size, report, needs=needs, why=why, cameras=cameras).require_rows()
     cache = opened.cache
     if not sees:
         usual = [
@@ -102,7 +118,7 @@ def open_demonstrations(
         ]
         sees = tuple(name for name in usual if len(_shape(opened, name) or ()) in (0, 1, 3))
     for name in sees:
-        if name in NOT_SEEN - {"pose", "latent", "expert"} or _shape(opened, name) is None:
+        if name in NOT_SEEN - {"pose", "latent", "expert", "action_confidence"} or _shape(opened, name) is None:
             known = ", ".join(name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN)
             raise DatasetError(f"a policy cannot see '{name}' of {opened.name}; it has {known or 'nothing to see'}.")
     if not sees:

@@ -1,0 +1,117 @@
+"""Inverse dynamics: actions are named from what they did, with a confidence that can be believed, and policies learn from them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tests.learn.test_imitation import NAME, teacher
+
+import terrella
+from terrella.cli import main
+from terrella.core.policy import Random
+from terrella.core.world import make_rng
+from terrella.data import ClipCache, Dataset, record
+from terrella.learn.calibration import Isotonic, calibration_error
+from terrella.learn.recipes.inverse import InverseTraining
+from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.workflows.inverse import InverseConfig, train_inverse
+
+QUICK = ["--steps", "80", "--batch", "64", "--hidden", "32", "--learning-rate", "0.005", "--sees", "grid"]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inverse") / "recording"
+    world = GymnasiumWorld("TerrellaFetch-v0")
+    record(
+        world, terrella.load_policy(f"{teacher.__code__.co_filename}:teacher@0.2", world.spec), folder, 600, make_rng(0)
+    )
+    return folder
+
+
+def test_confidence_is_the_share_that_is_right():
+    rng = np.random.default_rng(0)
+    scores = rng.random(4000)
+    right = rng.random(4000) < scores**2  # as confident as wrong
+    calibration = Isotonic.fit(scores[:2000], right[:2000])
+    assert (np.diff(calibration(np.linspace(0, 1, 50))) >= 0).all()
+    before, after = (calibration_error(one, right[2000:]) for one in (scores[2000:], calibration(scores[2000:])))
+    assert before > 0.12 and after < 0.05
+    assert 0 < calibration(np.array([0.0]))[0] < calibration(np.array([1.0]))[0] < 1
+    assert calibration_error(np.full(4, 0.5), np.array([0, 1, 0, 1])) == 0
+
+
+def test_a_few_labelled_episodes_label_the_rest(recording, tmp_path, capsys):
+    words = ["train", "inverse", str(recording), "--out", str(tmp_path / "run"), "--labelled", "0.2", *QUICK]
+    assert main([*words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["true_accuracy"] > 0.9 > facts["usual_accuracy"] and facts["labels"] > 200
+    assert "--method imitation" in facts["next"]
+    before, after = (ClipCache.open(Dataset(folder), (64, 64)) for folder in (recording, facts["recording"]))
+    sure = after.arrays["observation.action_confidence"][:, 0]
+    valid, same = np.asarray(before.action_valid), (before.action == after.action)[:, 0]
+    assert after.action_valid.tolist() == valid.tolist() and before.tasks == after.tasks
+    assert sure.min() > 0 and (sure[valid & ~same] < 1).all() and sure[valid & same].mean() > sure[valid & ~same].mean()
+    assert after.world["action_names"] == before.world["action_names"]
+    assert main([*words, "--json"]) == 0  # the finished run labels again
+    assert json.loads(capsys.readouterr().out)["true_accuracy"] == facts["true_accuracy"]
+
+
+def test_clips_without_actions_are_labelled_by_another_recording(recording, tmp_path, capsys):
+    world = GymnasiumWorld("TerrellaFetch-v0")
+    record(world, Random(world.spec), tmp_path / "clips", 100, make_rng(1))
+    words = [
+        "train",
+        "inverse",
+        str(tmp_path / "clips"),
+        "--labels",
+        str(recording),
+        "--out",
+        str(tmp_path / "run"),
+        *QUICK,
+    ]
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["true_accuracy"] > 0.8
+    about = tmp_path / "clips" / "meta" / "terrella.json"
+    about.write_text(about.read_text().replace(NAME.rpartition(":")[2], "Other-v0"))
+    assert main([*words[: -len(QUICK) - 1], str(tmp_path / "other"), *QUICK]) == 2
+    assert "is of gym:Other-v0, and the labels" in capsys.readouterr().err
+
+
+def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, capsys):
+    words = [
+        "train",
+        "inverse",
+        str(recording),
+        "--out",
+        str(tmp_path / "run"),
+        "--labelled",
+        "0.1",
+        *QUICK,
+        "--compare",
+    ]
+    assert main([*words, "--real", NAME, "--policy-steps", "40", "--episodes", "20"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("The model names ") and "of what the true ones gain over random actions" in text
+    assert all(f"\n{arm}" in text for arm in ("labelled only", "pseudo-labelled", "all labelled", "random"))
+    assert main([*words, "--out", str(tmp_path / "x")]) == 2
+    assert "--compare plays in an environment" in capsys.readouterr().err
+
+
+def test_labels_of_axes_are_near_the_truth(tmp_path):
+    world = GymnasiumWorld("Pendulum-v1", rgb=False)
+    record(replace_limit(world, 50), Random(world.spec), tmp_path / "recording", 800, make_rng(0))
+    training = InverseTraining(steps=250, hidden=64, before=0, after=1, learning_rate=3e-3)
+    result = train_inverse(tmp_path / "recording", InverseConfig(tmp_path / "run", training, labelled=0.4))
+    assert result.facts["true_accuracy"] > 2 * result.facts["usual_accuracy"]
+    actions = ClipCache.open(Dataset(result.facts["recording"]), (64, 64)).action
+    assert np.abs(actions).max() <= 2.0 and torch.isfinite(torch.from_numpy(np.array(actions))).all()
+
+
+def replace_limit(world, steps):
+    world.spec = replace(world.spec, max_episode_steps=steps)
+    return world
