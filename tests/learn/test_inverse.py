@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
-import torch
+from gymnasium import spaces
 from tests.learn.test_imitation import NAME, teacher
 
 import terrella
+from terrella.act.policies_by_name import NoisyPolicy
 from terrella.cli import main
-from terrella.core.policy import Random
+from terrella.core.policy import Random, Reactive
 from terrella.core.world import make_rng
 from terrella.data import ClipCache, Dataset, record
 from terrella.learn.calibration import Isotonic, calibration_error
@@ -20,7 +21,7 @@ from terrella.learn.recipes.inverse import InverseTraining
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.inverse import InverseConfig, train_inverse
 
-QUICK = ["--steps", "80", "--batch", "64", "--hidden", "32", "--learning-rate", "0.005", "--sees", "grid"]
+QUICK = ["--steps", "120", "--batch", "64", "--hidden", "32", "--learning-rate", "0.005", "--sees", "grid"]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_a_few_labelled_episodes_label_the_rest(recording, tmp_path, capsys):
 
 def test_clips_without_actions_are_labelled_by_another_recording(recording, tmp_path, capsys):
     world = GymnasiumWorld("TerrellaFetch-v0")
-    record(world, Random(world.spec), tmp_path / "clips", 100, make_rng(1))
+    record(world, NoisyPolicy(Reactive(teacher), 0.5, world.spec), tmp_path / "clips", 100, make_rng(1))
     words = [
         "train",
         "inverse",
@@ -75,7 +76,7 @@ def test_clips_without_actions_are_labelled_by_another_recording(recording, tmp_
         *QUICK,
     ]
     assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["true_accuracy"] > 0.8
+    assert json.loads(capsys.readouterr().out)["true_accuracy"] > 0.6
     about = tmp_path / "clips" / "meta" / "terrella.json"
     about.write_text(about.read_text().replace(NAME.rpartition(":")[2], "Other-v0"))
     assert main([*words[: -len(QUICK) - 1], str(tmp_path / "other"), *QUICK]) == 2
@@ -94,7 +95,7 @@ def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, 
         *QUICK,
         "--compare",
     ]
-    assert main([*words, "--real", NAME, "--policy-steps", "40", "--episodes", "20"]) == 0
+    assert main([*words, "--real", NAME, "--policy-steps", "40", "--episodes", "10"]) == 0
     text = capsys.readouterr().out
     assert text.startswith("The model names ") and "of what the true ones gain over random actions" in text
     assert all(f"\n{arm}" in text for arm in ("labelled only", "pseudo-labelled", "all labelled", "random"))
@@ -102,16 +103,31 @@ def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, 
     assert "--compare plays in an environment" in capsys.readouterr().err
 
 
+class Slide(gymnasium.Env):
+    """A thing whose speed is the action."""
+
+    action_space = spaces.Box(-2, 2, (1,), np.float32)
+    observation_space = spaces.Box(-100, 100, (2,), np.float32)
+    metadata = {"render_modes": ["ansi"], "render_fps": 10}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.at, self.steps = 0.0, 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.at, self.steps = self.at + float(action[0]), self.steps + 1
+        return np.array([self.at, action[0]], np.float32), 0.0, False, self.steps >= 40, {}
+
+
 def test_labels_of_axes_are_near_the_truth(tmp_path):
-    world = GymnasiumWorld("Pendulum-v1", rgb=False)
-    record(replace_limit(world, 50), Random(world.spec), tmp_path / "recording", 800, make_rng(0))
+    world = GymnasiumWorld(Slide)
+    record(world, Random(world.spec), tmp_path / "recording", 600, make_rng(0))
     training = InverseTraining(steps=250, hidden=64, before=0, after=1, learning_rate=3e-3)
-    result = train_inverse(tmp_path / "recording", InverseConfig(tmp_path / "run", training, labelled=0.4))
-    assert result.facts["true_accuracy"] > 2 * result.facts["usual_accuracy"]
-    actions = ClipCache.open(Dataset(result.facts["recording"]), (64, 64)).action
-    assert np.abs(actions).max() <= 2.0 and torch.isfinite(torch.from_numpy(np.array(actions))).all()
-
-
-def replace_limit(world, steps):
-    world.spec = replace(world.spec, max_episode_steps=steps)
-    return world
+    result = train_inverse(tmp_path / "recording", InverseConfig(tmp_path / "run", training, labelled=0.5))
+    assert result.facts["true_accuracy"] > 0.5 > 2 * result.facts["usual_accuracy"]
+    before, after = (
+        ClipCache.open(Dataset(folder), (64, 64)) for folder in (tmp_path / "recording", result.facts["recording"])
+    )
+    valid = np.asarray(before.action_valid)
+    assert np.abs(after.action[valid] - before.action[valid]).mean() < 0.5 and np.abs(after.action).max() <= 2.0
