@@ -179,7 +179,7 @@ class _Learning:
         """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
         schedule = self.schedule
         self.progress("A trial of some seconds: what does this machine manage?")
-        pace = time_environment(world, self.config.seed, TrainConfig())
+        pace = time_environment(world, self.config.seed, TrainConfig(device=self.config.device))
         if pace is None:
             return
         recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
