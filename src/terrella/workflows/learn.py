@@ -227,7 +227,7 @@ class _Learning:
 
         options = RecordOptions(max_episode_steps=schedule.facts["longest"], pictures=storage_of(world.spec))
         policy = policy_of(self.config.policy, world.spec, world) if self.config.policy else None
-        explore(world, out, frames, self.config.seed, counted, options, policy, enough)
+        explore(world, out, frames, self.config.seed, counted, options, policy, enough=enough)
         dataset = Dataset(out)
         if dataset.length < min(FEWEST_FRAMES, frames):
             raise DatasetError(
