@@ -75,6 +75,7 @@ class StepPrograms:
             self.world.advance(state, numbers, seeds)["reward"]  # writes the constants, outside of what is traced
         rows = [arena.reserve(state.batch) for arena in state.arenas.values()]
         inputs = [*(state[name] for name in sorted(state)), numbers, seeds, *rows]
+        inputs = [part.clone() for part in inputs]  # a tensor that stands for two inputs would be traced as one
         graph, after = traced(self.world, state, inputs)
         run, way = compiled(graph, inputs, self.compiler)
         if state.device.type == "cuda":
