@@ -221,15 +221,16 @@ def test_a_recording_far_away_is_learned_like_a_near_one(geometry, far, corridor
 
 
 def test_of_two_cameras_the_main_one_is_learned_and_the_other_named_as_ignored(tmp_path):
-    channels = {name: spaces.Box(0, 255, (24, 32, 3), np.uint8) for name in ("rgb", "rgb.wrist")}
-    views = {name: Camera((0.5, 0.8, 0.5, 0.5), (24, 32)) for name in channels}
+    sizes = {"rgb": (24, 32), "rgb.wrist": (18, 24)}  # of equal size they would be learned side by side
+    channels = {name: spaces.Box(0, 255, (*size, 3), np.uint8) for name, size in sizes.items()}
+    views = {name: Camera((0.5, 0.8, 0.5, 0.5), size) for name, size in sizes.items()}
     pose = spaces.Box(-np.inf, np.inf, (7,), np.float32)
     arm = spaces.Box(np.array([-1, -2], np.float32), np.array([1, 2], np.float32))
     spec = Spec("arm", arm, {**channels, "pose": pose}, (), 0.1, cameras=views, action_names=("reach", "turn"))
     with Recorder(tmp_path / "set", Layout.of(spec)) as recorder:
         for _ in range(2):
             for step in range(90):
-                seen: dict = {name: np.full((24, 32, 3), 40 + step + at, np.uint8) for at, name in enumerate(channels)}
+                seen: dict = {name: np.full((*size, 3), 40 + step, np.uint8) for name, size in sizes.items()}
                 seen["pose"] = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
                 recorder.add(seen, np.array([step / 90, -step / 90], np.float32) if step < 89 else None, 0.0, False)
             recorder.end_episode()

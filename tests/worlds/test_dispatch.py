@@ -71,7 +71,9 @@ def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name):
         print(f"{name}, batch {batch}: {count}")
         counts.append(count)
     assert all(count.kernels <= most for count in counts), counts[0].by_site.most_common(20)
-    assert abs(counts[0].kernels - counts[1].kernels) <= 6, "a batch of one may skip a copy"
+    assert abs(counts[0].kernels - counts[1].kernels) <= 0.02 * counts[0].kernels + 4, (
+        "a batch of one may skip some copies"
+    )
     assert all(count.waits == 0 and count.crossings <= 2 for count in counts), "the action and the seeds alone cross"
 
 
