@@ -1,6 +1,7 @@
 """Makes docs/images/play.webp: a few seconds inside a learned world, with the keys that are held.
 
     python recipes/play_animation.py docs/images/play.webp --seed 5
+    python recipes/play_animation.py docs/images/islet.webp --world islet --seed 3 --seconds 8 --every 2 --quality 55
 
 Every frame is drawn by the world from the state before it and the keys. The keys are those of act/explorer.py, and where
 things move those of `shoot`.
@@ -25,6 +26,7 @@ GROUND, RAISED, LINE, INK, MUTED, HELD = "#0b0c0f", "#14161a", "#24272d", "#ecea
 CAPS = [  # label, column, row, action
     ("W", 1, 0, "MOVE_FORWARD"), ("A", 0, 1, "MOVE_LEFT"), ("S", 1, 1, "MOVE_BACKWARD"), ("D", 2, 1, "MOVE_RIGHT"),
     ("<", 4, 1, "TURN_LEFT"), (">", 5, 1, "TURN_RIGHT"), ("Space", 4, 0, "ATTACK"),
+    ("W", 1, 0, "up"), ("A", 0, 1, "left"), ("S", 1, 1, "down"), ("D", 2, 1, "right"),
 ]  # fmt: skip
 CAP, GAP, MARGIN = 34, 4, 14
 
@@ -70,7 +72,12 @@ def play(world, seed: int, skip: int, steps: int) -> tuple[list[Image.Image], li
             action, memory = act(policy, seen, memory, 1, spec, rng)
         if step >= skip:
             pictures.append(Image.fromarray(seen["rgb"][0].cpu().numpy()))
-            pressed.append({name for name, on in zip(spec.action_names, action[0].tolist()) if on})
+            buttons = (
+                action[0].tolist()
+                if action.ndim > 1
+                else [number == int(action) for number in range(len(spec.action_names))]
+            )
+            pressed.append({name for name, on in zip(spec.action_names, buttons) if on})
         state = world.imagine(state, action, rng)
     return pictures, pressed
 

@@ -106,7 +106,6 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     if SCORING in schedule.facts:
         progress(f"{schedule.folder} is finished; --minutes with more than {schedule.minutes:g} trains it further.")
     else:
-        progress(f"{schedule.folder} is learned on {describe_device(device_of(config.device))}")
         _Learning(environment, config, schedule, progress).run()
     score = schedule.facts[SCORING]
     card = Path(score["card"]) if "card" in score else None
@@ -164,7 +163,10 @@ class _Learning:
         """One line about the stages to come, with their times."""
         schedule = self.schedule
         parts = [f"{text} {duration(schedule.left_s(at))}" for at, text in _DOES.items() if at not in schedule.facts]
-        self.progress(f"Of {duration(schedule.seconds)} it {', '.join(parts)}; all files are in {schedule.folder}.")
+        device = describe_device(device_of(self.config.device))
+        self.progress(
+            f"Of {duration(schedule.seconds)} on {device} it {', '.join(parts)}; all files are in {schedule.folder}."
+        )
         self.progress(
             f"From {duration(self._strip_s)} after training begins, `{command('terrella', 'play', schedule.folder)}` plays the "
             f"newest state of the world (start it again for a newer one), and {schedule.live_page()} shows truth and prediction."

@@ -125,7 +125,8 @@ def describe_device(name: str) -> str:
     if device.type == "cuda":
         facts = torch.cuda.get_device_properties(device)
         return f"{name} ({facts.name}, {facts.total_memory / 2**30:.0f} GiB)"
-    return f"{name} ({torch.get_num_threads()} threads)" if device.type == "cpu" else name
+    threads = torch.get_num_threads()
+    return f"{name} ({threads} thread{'s'[: threads > 1]})" if device.type == "cpu" else name
 
 
 def device_of(name: str) -> str:
