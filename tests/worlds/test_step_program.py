@@ -69,8 +69,7 @@ def test_parts_that_share_a_tensor_are_traced_apart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["doom-maze", "doom-corridor"])
-@pytest.mark.parametrize("compiler", ["eager", "inductor"])
+@pytest.mark.parametrize(("name", "compiler"), [("doom-maze", "eager"), ("doom-corridor", "inductor")])
 def test_bundled_worlds_compile_whole(name, compiler):
     world = terrella.load(name)
     steps = StepPrograms(world, compiler)

@@ -168,8 +168,8 @@ class Memory:
     def _room(self, held: Held, views: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
         """A slot for a new keyframe of each of `views` [n]: a free one or, where `wanted` [n], that of the keyframe to drop."""
         kind, born = held["memory_kind"][views], held["memory_born"][views]
-        free, slot = (kind == EMPTY).max(1)
-        full = wanted & ~free
+        lowest, slot = kind.min(1)  # EMPTY is the lowest kind
+        full = wanted & (lowest != EMPTY)
         if kernels_do(kind) and not full.any():
             return slot
         some = full.nonzero()[:, 0] if kernels_do(kind) else torch.arange(len(views), device=kind.device)
