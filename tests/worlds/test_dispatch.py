@@ -47,14 +47,17 @@ WORLDS = {
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 2600),
     "flow": (lambda: flow(0), 450),
     "flow that scrolls": (lambda: flow(15), 1000),
+    "islet": (lambda: terrella.load("islet"), 1000),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name):
+def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name, monkeypatch):
     make, most = WORLDS[name]
+    lists, tensor_of = [], torch.tensor  # copies of lists to a device are not dispatched on meta
+    monkeypatch.setattr(torch, "tensor", lambda *given, **kinds: lists.append(given) or tensor_of(*given, **kinds))
     world = make().to("meta")
     shown = [channel for channel in ("rgb", "reward", "done") if channel in world.spec.channels]
     counts = []
@@ -65,15 +68,16 @@ def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name):
         for _ in range(2):
             state = world.imagine(state, action, rng)
             world.render(state, shown)
+        for arena in state.arenas.values():
+            arena.make_room(batch)  # so that it does not grow in the step that is counted
+        lists.clear()
         with Dispatches("meta") as count:
             state = world.imagine(state, action, rng)
             world.render(state, shown)
-        print(f"{name}, batch {batch}: {count}")
+        assert not lists
         counts.append(count)
     assert all(count.kernels <= most for count in counts), counts[0].by_site.most_common(20)
-    assert abs(counts[0].kernels - counts[1].kernels) <= 0.02 * counts[0].kernels + 4, (
-        "a batch of one may skip some copies"
-    )
+    assert abs(counts[0].kernels - counts[1].kernels) <= 6, "a batch of one may skip a copy"
     assert all(count.waits == 0 and count.crossings <= 2 for count in counts), "the action and the seeds alone cross"
 
 

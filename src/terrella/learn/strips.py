@@ -9,6 +9,7 @@ from PIL import Image
 
 from ..core.world import make_rng
 from ..worlds.learned import LearnedWorld
+from ..worlds.parts import newest_frame
 from .recording import Recording
 
 
@@ -32,11 +33,11 @@ def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch
     things, under the recorded actions."""
     rng, config = make_rng(1), world.config
     state = world.observe(recording.evidence(config, rows[:1]), None, rng)
-    frames = [world.frame(state)]
+    frames = [newest_frame(state)]
     for row in rows[1:]:
         if config.geometry and not config.moving:  # what moves depends on actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
             state = world.imagine(state, recording.recorded_actions(world.spec, [row - 1]), rng)
-        frames.append(world.frame(state))
+        frames.append(newest_frame(state))
     return torch.cat(frames)[::8].cpu()

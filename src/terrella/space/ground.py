@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 import torch.nn.functional as F
 
-from .mosaic import SAME, read_mosaic
+from ..core.backend import constant
+from .mosaic import SAME, middle, read_mosaic
 
 LEAST = 0.5  # share of a picture that must lie on the ground
 ALIKE = 0.6  # share of equal pixels from which a picture is recognised
@@ -44,8 +45,8 @@ def locate(pictures: torch.Tensor, shown: torch.Tensor, ground: torch.Tensor) ->
 
 def window(ground: torch.Tensor, place: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """The part of a ground with its upper left corners at `place` int64 [B, 2] (x, y): uint8 [B, 4, *size], 0 beyond the ground."""
-    middle = torch.tensor([(whole - part) // 2 for whole, part in zip(ground.shape[:0:-1], size[::-1])])
-    return read_mosaic(ground.expand(len(place), -1, -1, -1), size, middle.to(place.device) - place)
+    at = constant(torch.tensor, place.device, middle(ground, size)[::-1])
+    return read_mosaic(ground.expand(len(place), -1, -1, -1), size, at - place)
 
 
 def joined(grounds: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -78,9 +78,8 @@ class VideoConfig:
     residual: bool = False  # a frame is the newest one and its change, without mixture and noise
     objects: bool = False  # things are billboards (worlds/objects.py), which the generator neither sees nor draws
     moving: bool = False  # things move: the generator sees the last two frames, and memory keeps what stands still
-    cameras: tuple[
-        str, ...
-    ] = ()  # of a frames-only world: picture channels side by side in a frame, from the left; (): rgb alone
+    # of a frames-only world: picture channels side by side in a frame, from the left; (): rgb alone
+    cameras: tuple[str, ...] = ()
 
     @property
     def generator(self) -> GeneratorConfig:

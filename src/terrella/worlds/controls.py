@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from gymnasium import spaces
 
+from ..core.backend import constant
 from ..core.errors import ContractError
 from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
 
@@ -71,6 +72,6 @@ class Controls:
             picked = [(whole[:, n] - int(low)).clamp(0, self.counts[n] - 1) for n, low in enumerate(self.low)]
             return torch.cat([F.one_hot(one, count) for one, count in zip(picked, self.counts)], 1).float()
         if self.kind == AXES:
-            low, high = (torch.tensor(limit, device=action.device) for limit in (self.low, self.high))
+            low, high = (constant(torch.tensor, action.device, limit) for limit in (self.low, self.high))
             return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
         return given

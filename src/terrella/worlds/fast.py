@@ -49,8 +49,8 @@ EAGER, ONNX = "eager torch", "ONNX Runtime"
 
 def faster(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
     """The world with the faster of two ways, and which it is: on a CPU eager torch or ONNX Runtime for the generator; on a GPU
-    steps as they are or as compiled programs, CUDA graphs (step_program.py). Frames that need a gradient are drawn by eager torch.
-    TerrellaError where ONNX Runtime is not installed."""
+    steps as they are or as compiled programs, CUDA graphs (step_program.py), which have no gradients. TerrellaError where ONNX
+    Runtime is not installed."""
     return with_faster_generator(world) if world.device.type == "cpu" else with_step_programs(world)
 
 
@@ -77,7 +77,8 @@ def with_step_programs(world: LearnedWorld, compiler: str | None = "inductor") -
 
 
 def with_faster_generator(world: LearnedWorld) -> tuple[LearnedWorld, Choice]:
-    """The world whose generator draws by ONNX Runtime, if that is faster on this CPU."""
+    """The world whose generator draws by ONNX Runtime, if that is faster on this CPU. Frames that need a gradient are drawn by
+    eager torch."""
     generator: nn.Module = copy.deepcopy(world.generator)
     if not isinstance(generator, UNet):
         raise TerrellaError("--fast is for worlds with depth and poses; play this one without it.")

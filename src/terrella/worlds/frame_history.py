@@ -15,6 +15,7 @@ import torch
 from gymnasium import spaces
 
 from ..core import chance
+from ..core.backend import constant
 from ..core.errors import ObservationError
 from ..core.state import State
 from ..space.camera import Intrinsics
@@ -175,7 +176,7 @@ class FrameHistory:
         whole = update_mosaic(state["mosaic"], frame, move, self.over)
         if not self.grounded:
             return whole
-        at = state["place"] - torch.tensor(middle(whole, self.config.size)[::-1], device=self.device)
+        at = state["place"] - constant(torch.tensor, self.device, middle(whole, self.config.size)[::-1])
         ground = window(self.ground, at, (whole.shape[2], whole.shape[3]))
         return torch.where(ground[:, 3:] > 0, ground, whole)
 

@@ -7,7 +7,7 @@ Pictures are decoded only on request, for people (joint-embedding loss: LeWorldM
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import final
 
 import numpy as np
@@ -38,9 +38,6 @@ class LatentWorld:
         self.network = network.eval().requires_grad_(False)
         self.starts = starts.to(network.mean.device)
         self.spec = self._spec()
-        self.stepper: Callable[[State, torch.Tensor, torch.Tensor | None], State] | None = (
-            None  # in place of `advance`: fast.py
-        )
 
     @property
     def device(self) -> torch.device:
@@ -122,9 +119,9 @@ class LatentWorld:
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         """One step. Episodes that are over stand still."""
         taken = self.controls.encode(self.spec.check_action(action, state.batch).to(self.device))
-        return (self.stepper or self.advance)(state, taken, None)
+        return self.advance(state, taken)
 
-    def advance(self, state: State, taken: torch.Tensor, seeds: torch.Tensor | None) -> State:
+    def advance(self, state: State, taken: torch.Tensor, seeds: torch.Tensor | None = None) -> State:
         """The part of `imagine` that is tensors alone, by actions [B, A] of `controls.encode`; nothing is drawn by chance."""
         network, window, still = self.network, state["window"], state["done"]
         actions = torch.cat([state["actions"], taken[:, None]], 1)

@@ -49,9 +49,8 @@ class About:
     ignored: tuple[str, ...] = ()  # channels of the recording that were not learned
     idle: tuple[float, ...] = ()
     max_episode_steps: int | None = None
-    cameras: Mapping[str, Camera] = field(
-        default_factory=dict
-    )  # of frames without a scene in space, where they are known
+    # of frames without a scene in space, where they are known
+    cameras: Mapping[str, Camera] = field(default_factory=dict)
 
 
 @final
@@ -79,9 +78,8 @@ class LearnedWorld:
         self.uncertainty: Uncertainty = _finished(uncertainty or NoUncertainty())
         self.estimator: Any = _finished(estimator or NoEstimator())
         self.history = max(self.body.history, scene.history)
-        self.stepper: Callable[[State, torch.Tensor, torch.Tensor], State] | None = (
-            None  # in place of `advance`: fast.py
-        )
+        # in place of `advance`: fast.py
+        self.stepper: Callable[[State, torch.Tensor, torch.Tensor], State] | None = None
         self.size = scene.config.size
         self._drawn_names = (*scene.drawn_names, *Expected._fields)
         self.spec = self._spec()
@@ -107,10 +105,6 @@ class LearnedWorld:
     def cameras(self) -> tuple[str, ...]:
         """The picture channels that lie side by side in its frames, from the left."""
         return tuple(getattr(self.scene.config, "cameras", ())) or ("rgb",)
-
-    def frame(self, state: State) -> torch.Tensor:
-        """The whole frame of a state, its cameras' pictures side by side: uint8 [B, 3, H, W]."""
-        return torch.cat(list(self.render(state, self.cameras).values()), 2).permute(0, 3, 1, 2).contiguous()
 
     @property
     def starts(self) -> Keyframes | StartClips:

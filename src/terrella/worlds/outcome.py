@@ -13,6 +13,7 @@ from gymnasium import spaces
 from torch import nn
 
 from ..core import chance
+from ..core.backend import constant
 from ..core.errors import ObservationError
 from ..core.spec import DONE, REWARD
 from ..core.state import State
@@ -169,14 +170,14 @@ class FrameOutcome(nn.Module):
         self, seen: torch.Tensor, action: torch.Tensor, vitals: torch.Tensor, hidden: torch.Tensor
     ) -> OutcomeLogits:
         """From `seen` [B, 128]; action [B, actions]; vitals [B, V] before the step; hidden [B, hidden]."""
-        spans = torch.tensor(self.config.spans, device=seen.device)
+        spans = constant(torch.tensor, seen.device, self.config.spans)
         hidden = self.remember(torch.cat([seen, action, vitals / spans], 1), hidden)
         known = torch.cat([seen, hidden], 1)
         return OutcomeLogits(self.paid(known), [head(known) for head in self.changed], hidden, known)
 
     def ends(self, known: torch.Tensor, vitals: torch.Tensor) -> torch.Tensor:
         """The logit [B] that the episode is over, from OutcomeLogits.known and the vitals [B, V] after the step."""
-        spans = torch.tensor(self.config.spans, device=known.device)
+        spans = constant(torch.tensor, known.device, self.config.spans)
         used_up = 4.0 * (vitals <= 0)  # large, so that it is learned from few ends
         return self.ending(torch.cat([known, vitals / spans, used_up], 1))[:, 0]
 
@@ -195,7 +196,7 @@ class FrameOutcome(nn.Module):
         reward = (read.reward.float().softmax(1) * self.rewards).sum(1)
         changes = []
         for column, (logits, values) in enumerate(zip(read.changes, self.config.changes)):
-            levels, chances = torch.tensor(values, device=logits.device), logits.float().softmax(1)
+            levels, chances = constant(torch.tensor, logits.device, values), logits.float().softmax(1)
             picked = logits.argmax(1) if seeds is None else chance.choice(seeds, chances, stream=CHANGES + column)
             changes.append(levels[picked])
         left = vitals.float() + torch.stack(changes, 1) if changes else vitals

@@ -6,6 +6,7 @@ Tracing fails where a step looks at a value: such a step would wait for the devi
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, nullcontext
@@ -49,33 +50,37 @@ class StepProgram:
 
 
 class StepPrograms:
-    """`StepPrograms(world)(state, numbers, seeds)` is `world.advance(state, numbers, seeds)`. compiler: a backend of torch.compile;
-    None: the traced graph runs as it is."""
+    """`StepPrograms(world)(state, numbers, seeds)` is `world.advance(state, numbers, seeds)`, without gradients. compiler: a
+    backend of torch.compile; None: the traced graph runs as it is."""
 
     def __init__(self, world: Advancing, compiler: str | None = "inductor"):
         self.world, self.compiler = world, compiler
         self.programs: dict[int, StepProgram] = {}
+        self._lock = threading.Lock()  # a captured graph has one place for its inputs
 
-    def __call__(self, state: State, numbers: torch.Tensor, seeds: torch.Tensor | None) -> State:
-        seeds = numbers.new_zeros(len(numbers), dtype=torch.int64) if seeds is None else seeds
-        with torch.inference_mode(False), torch.no_grad():
+    def __call__(self, state: State, numbers: torch.Tensor, seeds: torch.Tensor) -> State:
+        with self._lock, torch.inference_mode(False), torch.no_grad():
             program = self.programs.get(state.batch)
             if program is None or not program.fits(state):
                 program = self.programs[state.batch] = self._made(state, numbers, seeds)
             rows = [arena.reserve(state.batch) for arena in state.arenas.values()]
             if not program.fits(state):  # the arena had to grow for that
                 return self.world.advance(state, numbers, seeds)
-            made = program.run([*(state[name] for name in program.before), numbers, seeds, *rows])
+            inputs = [*(state[name] for name in program.before), numbers, seeds, *rows]
+            made = program.run([part.contiguous() for part in inputs])  # entries of a fork share their memory
         return State(dict(zip(program.after, made)), state.arenas)
 
     def _made(self, state: State, numbers: torch.Tensor, seeds: torch.Tensor) -> StepProgram:
         for name, arena in state.arenas.items():
             arena.make_room(state[name].numel() + ROOM * state.batch)
         with _as_a_device(state.device):
-            self.world.advance(state, numbers, seeds)["reward"]  # writes the constants, outside of what is traced
+            dict(
+                self.world.advance(state, numbers, seeds)
+            )  # makes the constants of all that is drawn, outside of the trace
         rows = [arena.reserve(state.batch) for arena in state.arenas.values()]
         inputs = [*(state[name] for name in sorted(state)), numbers, seeds, *rows]
-        inputs = [part.clone() for part in inputs]  # a tensor that stands for two inputs would be traced as one
+        # a tensor that stands for two inputs would be traced as one
+        inputs = [part.clone(memory_format=torch.contiguous_format) for part in inputs]
         graph, after = traced(self.world, state, inputs)
         run, way = compiled(graph, inputs, self.compiler)
         if state.device.type == "cuda":

@@ -24,6 +24,7 @@ from ...core.files import replacing
 from ...core.world import Observation, make_rng
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
+from ...worlds.parts import newest_frame
 from ...worlds.uncertainty import (
     CELLS,
     KNOTS,
@@ -229,7 +230,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
             state = dreamer.observe({"pose": recording.pose(rows)}, state, chance)
         else:
             state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)
-        drawn = dreamer.frame(state).cpu().float() / 255
+        drawn = newest_frame(state).cpu().float() / 255
         maps, situation = inputs.pop()
         off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)
         cells = F.avg_pool2d(off, 2 * CELLS, ceil_mode=True, count_include_pad=False)
