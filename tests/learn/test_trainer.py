@@ -245,3 +245,16 @@ def test_a_stage_takes_at_most_its_share(tmp_path):
     budget = Budget(tmp_path, 2.0)
     budget.divide([Stage("motion", 0.1, lambda: None), Stage("flow", None, lambda: None)])
     assert budget.most_s("motion") == pytest.approx(720) and budget.most_s("flow") == 7200
+
+
+@pytest.mark.parametrize(("load", "threads"), [(0.5, 2), (99.0, 1)])
+def test_a_machine_that_becomes_busy_leaves_training_one_thread(load, threads, tmp_path, monkeypatch):
+    before = torch.get_num_threads()
+    monkeypatch.setattr(module, "LOOK_S", -1.0)
+    monkeypatch.setattr(module.os, "getloadavg", lambda: (load * (module.os.cpu_count() or 1), 0.0, 0.0))
+    try:
+        torch.set_num_threads(2)
+        trainer_in(tmp_path, steps=2).train()
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)

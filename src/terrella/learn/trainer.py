@@ -33,6 +33,7 @@ Report = Callable[[float, float, str], None]
 Paced = Callable[[int], None]
 LOG_EVERY = 20  # steps
 PACE_S = 30.0  # of training after which its pace is known, or sooner: after the first picture
+LOOK_S = 30.0  # between looks at how busy the machine is
 BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 CPU = torch.device("cpu")
 RETIRED = ("generator",)  # settings of earlier runs that no longer exist
@@ -270,7 +271,7 @@ class Trainer:
 
     def _train(self, draw: Callable[[], object] | None, stop: threading.Event, paced: Paced | None) -> None:
         facts, run = self.facts, self.run
-        began = saved = drawn = time.monotonic()
+        began = saved = drawn = looked = time.monotonic()
         before, first = facts["seconds"], self.steps_done
         while not self.finished and not stop.is_set():
             parts = self._step(facts["step"])
@@ -283,6 +284,9 @@ class Trainer:
             if now - saved > run.save_every_s:
                 self.save()
                 saved = now
+            if now - looked > LOOK_S:
+                yield_cores()
+                looked = now
             if draw is not None and now - drawn > run.strip_every_s:
                 draw()
                 drawn = time.monotonic()
