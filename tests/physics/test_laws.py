@@ -159,10 +159,20 @@ def test_a_system_survives_json_and_refuses_nonsense():
     for family in FAMILIES.values():
         facts = json.loads(json.dumps(family.system.to_json()))
         assert PhysicalSystem.from_json(facts) == family.system
-    with pytest.raises(TerrellaError, match="no colour"):
+    with pytest.raises(TerrellaError, match="body 0 has an unknown key 'colour'"):
         PhysicalSystem.from_json({"bodies": [{"name": "a", "position": {"channel": "x"}, "colour": "red"}]})
     with pytest.raises(TerrellaError, match="one body or more"):
         PhysicalSystem.from_json({"bodies": []})
+    body = {"name": "a", "position": {"channel": "x"}}
+    for part, said in (
+        ({"bodies": [{**body, "mass_kg": "heavy"}]}, "body 0 mass_kg = 'heavy' should be of type float"),
+        ({"bodies": [body], "gravity_m_s2": [0, 0]}, "gravity_m_s2 has 2 values; it needs 3"),
+        ({"bodies": [body], "walls": [{"centre_m": [0, 0, 0], "normal": [0, 0, 2]}]}, "the length 1"),
+        ({"bodies": [body], "axes": [0, 0]}, "each once"),
+        ({"bodies": [body], "limits": [{"name": "l", "slot": {"channel": "x"}, "low": 1, "high": 0}]}, "low is below"),
+    ):
+        with pytest.raises(TerrellaError, match=said):
+            PhysicalSystem.from_json(part)
     with pytest.raises(TerrellaError, match="a rod holds"):
         PhysicalSystem((RigidBody("a", Slot("x")),), rods=(Rod("b", (0.0, 0.0, 0.0), 1.0),))
 

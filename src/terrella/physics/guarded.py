@@ -218,20 +218,15 @@ class Guarded:
         """The violation of the last step by each law [B, L], in tolerances. fresh: episodes that have one step only."""
         if not self.tolerances:
             return motion.position.new_zeros(motion.batch, 0)
-        whole = torch.stack([one.law.residual(motion)[-1] / one.value for one in self.tolerances], 1)
-        if fresh.any():
-            short = motion.between(1, 3)
-            first = torch.stack([one.law.residual(short)[-1] / one.value for one in self.tolerances], 1)
-            whole = torch.where(fresh[:, None], first, whole)
-        return whole.nan_to_num(nan=torch.inf)
+        return torch.stack([_ratio(one, motion, fresh) for one in self.tolerances], 1)
 
     def _projected(self, motion: Trajectory, fresh: Tensor, allowed: Tensor) -> Trajectory:
         """Each broken law's projection in turn, on the rollouts that break it."""
         for _ in range(ROUNDS):
             if not ((self._ratios(motion, fresh) > 1).any(1) & allowed).any():
                 break
-            for number, one in enumerate(self.tolerances):
-                rows = (self._ratios(motion, fresh)[:, number] > 1) & allowed
+            for one in self.tolerances:
+                rows = (_ratio(one, motion, fresh) > 1) & allowed
                 if rows.any():
                     motion = _mixed(motion, one.law.correct(motion), rows)
         return motion
@@ -347,6 +342,14 @@ def _bare(state: State) -> State:
 
 def _done(state: State) -> Tensor:
     return state["done"].cpu() if "done" in state else torch.zeros(state.batch, dtype=torch.bool)
+
+
+def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
+    """The violation of the last step by a law [B], in tolerances. fresh: episodes that have one step only."""
+    whole = one.law.residual(motion)[-1]
+    if fresh.any():
+        whole = torch.where(fresh, one.law.residual(motion.between(1, 3))[-1], whole)
+    return (whole / one.value).nan_to_num(nan=torch.inf)
 
 
 def _way(motion: Trajectory) -> Tensor:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import TerrellaError
+from ..core.typed_values import typed
 
 EARTH = (0.0, 0.0, -9.81)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-CARD = "system"  # of a Spec's card, and of the facts of a recording
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,10 @@ class Slot:
 
     channel: str
     first: int = 0
+
+    def __post_init__(self):
+        if self.first < 0:
+            raise TerrellaError(f"a slot of '{self.channel}' begins at number {self.first}; the first one is 0.")
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,10 @@ class Wall:
     rotation: tuple[float, float, float, float] = UPRIGHT
     normal: tuple[float, float, float] | None = None
 
+    def __post_init__(self):
+        if self.normal is not None and abs(math.hypot(*self.normal) - 1) > 1e-3:
+            raise TerrellaError(f"a wall's normal is {self.normal}; give it the length 1.")
+
 
 @dataclass(frozen=True)
 class Rod:
@@ -68,6 +77,10 @@ class Rod:
     body: str
     pivot_m: tuple[float, float, float]
     length_m: float
+
+    def __post_init__(self):
+        if not self.length_m > 0:
+            raise TerrellaError(f"the rod of '{self.body}' is {self.length_m:g} m long; give it a length above 0.")
 
 
 @dataclass(frozen=True)
@@ -79,6 +92,10 @@ class Limit:
     low: float
     high: float
     unit: str = ""
+
+    def __post_init__(self):
+        if not self.low < self.high:
+            raise TerrellaError(f"the limit '{self.name}' is from {self.low:g} to {self.high:g}; low is below high.")
 
 
 @dataclass(frozen=True)
@@ -101,6 +118,10 @@ class PhysicalSystem:
         names = [body.name for body in self.bodies]
         if not names or len(set(names)) < len(names):
             raise TerrellaError("a physical system has one body or more, each with a name of its own.")
+        if any(len({*axes}) < len(axes) or not {*axes} <= {0, 1, 2} for axes in (self.axes, self.spin_axes)):
+            raise TerrellaError(
+                f"axes {self.axes} and spin_axes {self.spin_axes} are of 0 (x), 1 (y) and 2 (z), each once."
+            )
         if strangers := sorted({rod.body for rod in self.rods} - set(names)):
             raise TerrellaError(f"a rod holds {', '.join(strangers)}, which is no body; there are {', '.join(names)}.")
 
@@ -117,30 +138,16 @@ class PhysicalSystem:
     @staticmethod
     def from_json(facts: Mapping[str, Any]) -> PhysicalSystem:
         """The inverse of `to_json`; TerrellaError for other facts."""
-        kinds: dict[str, Any] = {"bodies": RigidBody, "walls": Wall, "rods": Rod, "limits": Limit}
-        try:
-            plain = {name: _tuples(value) for name, value in facts.items() if name not in kinds}
-            parts = {name: tuple(_made(kind, one) for one in facts.get(name, ())) for name, kind in kinds.items()}
-            return PhysicalSystem(**parts, **plain)
-        except (TypeError, ValueError, AttributeError, KeyError) as error:
-            raise TerrellaError(f"this is no physical system ({error}); docs/physics.md shows one.") from error
+        return typed(PhysicalSystem, dict(facts), "the physical system")
 
     @staticmethod
     def read(file: str | Path) -> PhysicalSystem:
         """The system in a JSON file; TerrellaError where it cannot be read."""
         try:
-            return PhysicalSystem.from_json(json.loads(Path(file).read_text(encoding="utf-8")))
+            facts = json.loads(Path(file).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise TerrellaError(f"{file} is no JSON file of a physical system ({error}).") from error
-
-
-def _made(kind: Any, facts: Mapping[str, Any]) -> Any:
-    known = {part.name for part in fields(kind)}
-    if unknown := sorted(set(facts) - known):
-        raise ValueError(f"a {kind.__name__} has no {', '.join(unknown)}")
-    slots = {name: Slot(**value) for name, value in facts.items() if isinstance(value, Mapping)}
-    return kind(**{name: slots[name] if name in slots else _tuples(value) for name, value in facts.items()})
-
-
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+        try:
+            return typed(PhysicalSystem, facts, "the physical system")
+        except TerrellaError as error:
+            raise TerrellaError(f"{file}: {error} docs/physics.md shows one.") from error

@@ -2,15 +2,15 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
-from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import tomlkit
 from tomlkit.items import InlineTable, Table
 
 from ...core.errors import DatasetError
+from ...core.typed_values import typed
 from .mapping import MergeMapping, Number, SourceMapping, check_inside
 
 _TOP = "Where each number of each robot goes in the merged recording. Edit this file and merge again with it."
@@ -156,40 +156,10 @@ def mapping_of(tables: dict) -> MergeMapping:
     given = {**dict.fromkeys(known, {}), **tables}
     if isinstance(given["rows"], dict):
         given["rows"] = {"max_gap_s": None, **given["rows"]}
-    values = {key: _value(hints[key], given[key], f"[{key}]") for key in known}
+    values = {key: typed(hints[key], given[key], f"[{key}]", DatasetError) for key in known}
     return MergeMapping(**values, sources=tuple(_read_source(it, f"source {i}") for i, it in enumerate(sources, 1)))
 
 
 def _read_source(values: Any, where: str) -> SourceMapping:
     named = isinstance(values, dict) and isinstance(values.get("embodiment"), str)
-    return _value(SourceMapping, values, f"{where} ({values['embodiment']})" if named else where)
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """A TOML value as that type; DatasetError where the type is wrong, or a table has an unknown or missing key."""
-    origin, parts = get_origin(hint), get_args(hint)
-    if NoneType in parts:
-        return None if value is None else _value(parts[0], value, where)
-    kind = list if origin is tuple else str if origin is Literal else dict if origin or is_dataclass(hint) else hint
-    if isinstance(value, bool) or not isinstance(value, (int, float) if kind is float else kind):
-        raise DatasetError(f"{where} = {value!r} should be of type {'table' if kind is dict else kind.__name__}.")
-    if origin is Literal and value not in parts:
-        raise DatasetError(f"{where} = '{value}' is unknown; choose {' or '.join(parts)}.")
-    if origin is tuple:
-        return tuple(_value(parts[0], it, f"{where.removesuffix('s')} {i}") for i, it in enumerate(value))
-    if is_dataclass(hint):
-        return _table_as(hint, value, where)
-    if kind is dict:
-        return {key: _value(parts[1], it, f"{where} '{key}'") for key, it in value.items()}
-    return float(value) if kind is float else value
-
-
-def _table_as(cls: Any, values: dict, where: str) -> Any:
-    hints = get_type_hints(cls)
-    for key in values:
-        if key not in hints:
-            raise DatasetError(f"{where} has an unknown key '{key}'; it may have {', '.join(hints)}.")
-    for field in fields(cls):
-        if field.default is MISSING and field.default_factory is MISSING and field.name not in values:
-            raise DatasetError(f"{where} lacks '{field.name}'; add it.")
-    return cls(**{key: _value(hints[key], it, f"{where} {key}") for key, it in values.items()})
+    return typed(SourceMapping, values, f"{where} ({values['embodiment']})" if named else where, DatasetError)
