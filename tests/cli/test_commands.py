@@ -34,12 +34,13 @@ OPTIONS = {
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
     "--pictures --policy --port --randomise --seed --size --task --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
-    "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth",
+    "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
     "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
     "--seed --size --spread --steps --success --task --temperature --trust --within",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
+    "bench costs": "--batch --device --fast --json --minutes --seed",
     "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",
     "check": "--coarse --data --device --fresh --json --out --rollouts --seed --steps --system",
     "list": "--json",

@@ -1,4 +1,4 @@
-"""The commands `plan`, `evaluate`, `transfer` and `bench acceleration`."""
+"""The commands `plan`, `evaluate`, `transfer`, `bench acceleration` and `bench costs`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,6 +6,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..workflows.acceleration import AccelerationConfig, measure_acceleration
+from ..workflows.costs import CostsConfig, measure_costs
 from ..workflows.evaluate import EvaluateConfig
 from ..workflows.evaluate import evaluate as run_evaluate
 from ..workflows.plan import plan as run_plan
@@ -71,3 +72,15 @@ def acceleration(world: WorldName, config: AccelerationConfig, json: Json = Fals
     """
     following = command("terrella", "train", "policy", out="runs/policy", **{"in": world})
     show(measure_acceleration(world, config, progress=say), json, following)
+
+
+def costs(world: WorldName, config: CostsConfig, json: Json = False) -> None:
+    """Measure what a world costs on this machine: milliseconds, joules and memory, of a frame, of an imagined second and of
+    a minute of play.
+
+    Joules are measured by RAPL and NVML where their counters can be read; else they are estimated, and labelled so.
+
+    Args:
+        world: A name of `terrella list`, a path, or a simulator.
+    """
+    show(measure_costs(world, config, progress=say), json, command("terrella", "play", world))

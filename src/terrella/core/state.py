@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -253,6 +253,19 @@ class State(Mapping):
         numbers = [torch.arange(end - state.batch, end, device=self.device) for state, end in zip(states, ends)]
         plan = Pick(tuple(states), pick(*numbers))
         return State(tensors, self._arenas, Deferred([name for name in self if name in late], plan))
+
+
+def memory_of(states: Sequence[State]) -> dict[Hashable, int]:
+    """The bytes of each storage of a tensor (by address) and of each arena row that the states keep alive, each once."""
+    held: dict[Hashable, int] = {}
+    for state in states:
+        for tensor in state.values():
+            storage = tensor.untyped_storage()
+            held[storage.data_ptr()] = storage.nbytes()
+        for name, arena in state.arenas.items():
+            rows = torch.unique(state[name]).tolist()
+            held |= {(id(arena), row): arena.row_bytes for row in rows if row}  # row 0 is empty
+    return held
 
 
 def _same(a: torch.Tensor, b: torch.Tensor) -> bool:

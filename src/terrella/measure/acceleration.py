@@ -3,16 +3,15 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
+from ..core.spec import BUTTONS, CHOICE
 from ..core.state import State
 from ..core.world import World, make_rng
+from .costs import EnergyMeter
 from .statistics import Figure, last_step_above
 
-POWERCAP = Path("/sys/class/powercap")
-WATTS_OF_A_CORE = 10.0  # assumed without an energy counter
 LEARNERS = ("observation", "reward", "done")  # channels rendered for a learner at each step
 
 
@@ -29,38 +28,20 @@ class Throughput:
         return self.aggregate / self.batch
 
 
-class EnergyMeter:
-    """Joules since its construction: from RAPL if the machine has it, else processor seconds times an assumed power."""
-
-    def __init__(self) -> None:
-        self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _of_a_processor(file))
-        self._first, self._busy = self._readings(), time.process_time()
-
-    @property
-    def how(self) -> str:
-        return "RAPL, the whole processor" if self.files else f"estimated: {WATTS_OF_A_CORE:g} W per busy core"
-
-    def joules(self) -> float:
-        if not self.files:
-            return WATTS_OF_A_CORE * (time.process_time() - self._busy)
-        # the value at which each counter wraps around
-        most = [int((file.parent / "max_energy_range_uj").read_text()) + 1 for file in self.files]
-        return sum((now - then) % wrap for now, then, wrap in zip(self._readings(), self._first, most)) / 1e6
-
-    def _readings(self) -> list[int]:
-        return [int(file.read_text()) for file in self.files]
-
-
 @torch.inference_mode()
 def measure_throughput(world: World, batch: int, seconds: float, seed: int = 0) -> Throughput:
     """Steps `batch` streams for about `seconds` of wall time with fresh uniform actions, rendering the channels of a learner."""
     rng, spec = make_rng(seed), world.spec
     shown = [name for name in LEARNERS if name in spec.channels]
-    low, high = (torch.as_tensor(limit).float() for limit in spec.action_limits)
-    state = _step(world, world.start(batch, rng), low, high, shown, rng)  # the first step may compile
-    fresh, steps, meter, began = state, 0, EnergyMeter(), time.perf_counter()
+    if spec.action_mode in (BUTTONS, CHOICE):
+        draw = lambda: spec.sample_action(batch, rng)  # noqa: E731
+    else:
+        low, high = (torch.as_tensor(limit).float() for limit in spec.action_limits)
+        draw = lambda: low + (high - low) * torch.rand(batch, *low.shape, generator=rng)  # noqa: E731
+    state = _step(world, world.start(batch, rng), draw(), shown, rng)  # the first step may compile
+    fresh, steps, meter, began = state, 0, EnergyMeter(state.device.type == "cuda"), time.perf_counter()
     while (took := time.perf_counter() - began) < seconds or steps < 3:
-        state = _step(world, state, low, high, shown, rng)
+        state = _step(world, state, draw(), shown, rng)
         steps += 1
         if steps % 50 == 0:
             state = fresh  # so that no episode is stepped after its end
@@ -68,10 +49,7 @@ def measure_throughput(world: World, batch: int, seconds: float, seed: int = 0) 
     return Throughput(batch, imagined / took, meter.joules() / imagined)
 
 
-def _step(
-    world: World, state: State, low: torch.Tensor, high: torch.Tensor, shown: Sequence[str], rng: torch.Generator
-) -> State:
-    action = low + (high - low) * torch.rand(state.batch, *low.shape, generator=rng)
+def _step(world: World, state: State, action: torch.Tensor, shown: Sequence[str], rng: torch.Generator) -> State:
     state = world.imagine(state, action, rng)
     world.render(state, shown)
     return state
@@ -97,12 +75,3 @@ def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, se
         )
         gains.append(torch.as_tensor(held - error))
     return last_step_above(torch.stack(gains, 1), torch.zeros(episodes), rng)
-
-
-def _of_a_processor(file: Path) -> bool:
-    """Whether a counter is readable and of one whole processor; that of the machine (psys) would count the same joules twice."""
-    try:
-        files = {name: (file.parent / name).read_text() for name in (file.name, "max_energy_range_uj", "name")}
-        return all(files.values()) and files["name"].startswith("package")
-    except OSError:
-        return False

@@ -1,13 +1,13 @@
 """The recent past of a session, within fixed budgets: pictures to show, and states to go back to."""
 
 from collections import deque
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 
-from ..core.state import State
+from ..core.state import State, memory_of
 
 
 class Image(NamedTuple):
@@ -103,7 +103,7 @@ class History:
             self._pictures[index] = replace(gone, states=None, rngs=None)
 
     def _count(self, moment: Moment, sign: int) -> None:
-        for key, size in _held(moment.states or ()).items():
+        for key, size in memory_of(moment.states or ()).items():
             entry = self._held.setdefault(key, [0, size])
             if sign > 0 and entry[0] == 0:
                 self.state_bytes += size
@@ -111,16 +111,3 @@ class History:
             if entry[0] == 0:
                 self.state_bytes -= entry[1]
                 del self._held[key]
-
-
-def _held(states: Sequence[State]) -> dict[Hashable, int]:
-    """The bytes of each storage (by address) and of each arena row that the states keep alive."""
-    held: dict[Hashable, int] = {}
-    for state in states:
-        for tensor in state.values():
-            storage = tensor.untyped_storage()
-            held[storage.data_ptr()] = storage.nbytes()
-        for name, arena in state.arenas.items():
-            rows = torch.unique(state[name]).tolist()
-            held |= {(id(arena), row): arena.row_bytes for row in rows if row}  # row 0 is empty
-    return held

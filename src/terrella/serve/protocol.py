@@ -201,6 +201,8 @@ def encode_event(kind: str, **body) -> str:
              goal, in unit, or null; considers: whether it has futures to show.
     acted:   the agent's last action, as held keys and, for axes, as numbers; both empty if the person acted.
     goal:    at: a place on the map; image: a JPEG in base64; words. Each is null unless it is the goal.
+    costs:   watts of the process; estimated: whether they are; how they were measured; bytes of the states of the session;
+             budget: the watts that play may take, or null; kept: whether it does; step_s: seconds of a step that keeps it.
     ended:   how the episode ended that the last frame was of: outcome ("died", "won", "lost" or "over"), text, steps.
     futures: step at which they were requested, and plans, from the chosen one down to the worst: cost (null if not finite), and
              image, a JPEG in base64 of `frames` frames side by side, from the decision to the plan's end.

@@ -28,6 +28,7 @@ from .guard import RateLimit
 from .http_server import application, serve_page, starting_command
 from .keys import Keep, KeyBook
 from .picture import uncertainty_levels
+from .power import Meter, Power
 from .presentation import aims, drawn_by, events_of, numbers_of
 from .recording import SinkFactory
 from .session import Session
@@ -50,6 +51,8 @@ class ServeConfig:
     faults: int = 20  # malformed messages after which its socket is closed
     history_s: float = 30.0  # seconds of pictures that are kept, for rewinding and clips
     state_mb: int = 256  # memory for the states among them, in MiB
+    meter: Meter | None = None  # measures the energy of this process, which the page then shows
+    watts: float | None = None  # the most that play may take: its steps are made slower; needs a meter
     record_in: str = ""  # where `sink_factory` records, in words
 
 
@@ -92,7 +95,8 @@ class Sessions:
                     f"{self.worlds[0].spec.name} is being played by somebody else; close the other page or try again later."
                 )
             self._end(min(absent, key=lambda session: session.detached_at or 0.0))
-        session = Session(self._make_timeline, self._worker, self._book)
+        power = None if self.config.meter is None else Power(self.config.meter, self.config.watts)
+        session = Session(self._make_timeline, self._worker, self._book, power)
         self._open[session.id] = session, asyncio.create_task(session.run())
         return session
 
@@ -278,7 +282,13 @@ def serve(
     """
     config = config or ServeConfig()
     sessions = Sessions(
-        worlds, config, sink_factory=sink_factory, picture=picture, policy=policy, keep=keep, kept_in=kept_in
+        worlds,
+        config,
+        sink_factory=sink_factory,
+        picture=picture,
+        policy=policy,
+        keep=keep,
+        kept_in=kept_in,
     )
     build = lambda token: build_app(sessions, config.host, token)  # noqa: E731
     serve_page(build, config.host, config.port, config.token, on_ready, websockets=True)

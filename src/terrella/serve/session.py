@@ -20,6 +20,7 @@ from .actions import MAX_AXES, axes_of, keys_of
 from .chart import EVERY_S
 from .history import Moment
 from .keys import KeyBook
+from .power import Power
 from .protocol import HeldControls, Show
 from .timeline import Timeline
 
@@ -35,7 +36,13 @@ class Session:
     which executes other messages in order between steps. Without a socket it pauses, with its recording closed, until it is
     attached again."""
 
-    def __init__(self, make_timeline: Callable[[], Timeline], worker: Executor, book: KeyBook | None = None):
+    def __init__(
+        self,
+        make_timeline: Callable[[], Timeline],
+        worker: Executor,
+        book: KeyBook | None = None,
+        power: Power | None = None,
+    ):
         self.id = secrets.token_urlsafe(16)
         self.timeline: Timeline | None = None
         self.detached_at: float | None = time.monotonic()
@@ -56,6 +63,7 @@ class Session:
         self._charted: dict[str, Any] = {}  # the map that the page has
         self._chart_due = self._futures_due = 0.0
         self._due = self._took_s = 0.0
+        self._power = power
 
     # -- the socket's side: called on the event loop, never waits ------------------------------------------------
 
@@ -178,6 +186,10 @@ class Session:
             alarm.cancel()
             return
         dt_s = timeline.spec.dt_s
+        if self._power is not None:
+            dt_s = max(dt_s, self._power.step_s)
+            if (costs := self._power.stepped(timeline.history.state_bytes)) is not None:
+                await self._event("costs", **costs)
         self._due = max(self._due + dt_s, now - dt_s)  # catches up after a late step, not after a long wait
         try:
             controls, moment, made_ms = await self._work(self._step, timeline)

@@ -15,7 +15,8 @@ from ..core.errors import TerrellaError
 from ..core.spec import BUTTONS, CHOICE
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import device_of
-from ..measure.acceleration import EnergyMeter, Throughput, measure_throughput, usable_horizon
+from ..measure.acceleration import Throughput, measure_throughput, usable_horizon
+from ..measure.costs import EnergyMeter
 from ..measure.statistics import Figure, ratio_interval
 from .opening import Device, load_named
 from .progress import Progress, silent
@@ -124,7 +125,7 @@ def measure_acceleration(
     horizon = None if real is None else _usable_horizon(mine, real, config.seed)
     if real is not None and config.agent and config.reference:
         retained = return_retained(real, config.agent, config.reference, config.episodes, config.seed)
-    energy = EnergyMeter().how + ("" if device_of(mine).type == "cpu" else ", without the GPU")
+    energy = EnergyMeter(device_of(mine).type == "cuda").how
     threads = torch.get_num_threads()
     return AccelerationResult(
         world, config.beside, mine.spec.dt_s, threads, energy, throughput, horizon, retained

@@ -16,11 +16,12 @@ from ..core.policy import Policy, Random
 from ..core.spec import neutral_action
 from ..core.world import World, make_rng
 from ..data import Layout, Recorder
+from ..measure.costs import EnergyMeter
 from ..serve import ServeConfig, SinkFactory, read_picture, serve
 from ..serve.agent import Agents
 from ..serve.guard import is_loopback
 from .key_keeper import KeyKeeper
-from .opening import ControlsConfig, Device, Fast, load_named
+from .opening import ControlsConfig, Device, Fast, device_of, load_named
 from .page_agents import PageAgents
 from .progress import Progress, silent
 
@@ -51,6 +52,9 @@ class PlayConfig:
     agent_ms: float = 30.0  # Time for a planner's decision, in milliseconds.
     policy: Literal["explore", "random"] | None = None
     """Script that acts while the controls are not touched."""
+    watts: float | None = None
+    """Power that play may take, in watts: steps are made slower to keep it, and the page says by how much. Without an energy
+    counter that may be read, watts are estimated from processor time."""
     record: Path | None = None  # Folder of a dataset to which the page can record.
     device: Device = "auto"
     fast: Fast = False
@@ -94,7 +98,8 @@ def prepared(
         "policy": _driver(worlds, config), "picture": picture, "sink_factory": _sink(worlds[0], keeper, config.record),
         "keep": keeper, "kept_in": keeper.place,
     }  # fmt: skip
-    page = replace(page, record_in=str(config.record or ""))
+    meter = EnergyMeter(device_of(config.device).startswith("cuda"))
+    page = replace(page, record_in=str(config.record or ""), meter=meter, watts=config.watts)
     if page.seed is None:
         page = replace(page, seed=first_seed(worlds[0]))
     return worlds, page, options
@@ -152,6 +157,8 @@ def _variety(world: World, seed: int) -> float:
 def _check(config: PlayConfig) -> None:
     if config.policy is not None and config.agent:
         raise TerrellaError("--policy and --agent both say who drives; give one of them.")
+    if config.watts is not None and not config.watts > 0:
+        raise TerrellaError(f"--watts {config.watts:g} is no power to play with; give watts above 0, as in --watts 5.")
     if not config.agent_ms > 0:
         raise TerrellaError("--agent-ms is a time above 0.")
     if config.compare and config.image is not None:

@@ -21,6 +21,7 @@ const app = $('app'), KEPT = 8192, LIFE = /^(health|life|lives|hp|hitpoints)$/i;
 const now = { step: 0, oldest: 0, newest: 0, score: 0, flags: 0, actionId: 0, vitals: [] };
 const seen = { painted: 0, dropped: 0, times: [], frames: [], latencies: [], latencyCount: 0 };
 let worlds = [], light = () => {}, status = {}, noRecord = '', recordIn = '', command = '', state = 'connecting';
+let costs = null, budgetSaid = '';
 let pending = null, controlsId = 0, autoPaused = false, recordSince = 0;
 
 // -- the connection -------------------------------------------------------------------------------------------------
@@ -75,6 +76,7 @@ function onEvent(body) {
   if (body.type === 'futures') futures.show(body);
   if (body.type === 'acted') driver.acted(body);
   if (body.type === 'ended') showEnding(body);
+  if (body.type === 'costs') showCosts(body);
   if (body.type === 'error') toast(body.text);
 }
 
@@ -260,6 +262,19 @@ function fps() {
   return times.length > 1 ? ((times.length - 1) * 1000) / (times[times.length - 1] - times[0]) : 0;
 }
 
+/** What play costs: watts of the server's process, labelled where they are estimated, and what keeping a budget takes. */
+function showCosts({ watts, estimated, how, bytes, budget, kept, step_s: step }) {
+  const pace = Math.min(1, worlds[0].dt_s / step), budgeted = budget ? `, of ${budget} W` : '';
+  costs = { watts, estimated, bytes, kept };
+  $('watts-cell').hidden = false;
+  $('watts-name').textContent = estimated ? 'est. power' : 'power';
+  write('watts', watts < 9.95 ? watts.toFixed(1) : Math.round(watts), 'W');
+  $('watts-cell').title = `Power of the server${budgeted} (${how}). The states of this session hold ${(bytes / 2 ** 20).toFixed(1)} MiB`;
+  const words = !budget || (kept && pace === 1) ? '' : kept ? `${budget} W are kept at ${Math.round(100 * pace)}% of the world's pace.` : step >= 1 ? `${budget} W cannot be kept, even at a step a second.` : '';
+  if (words && words.replace(/\d+%/, '') !== budgetSaid) toast(words);
+  budgetSaid = words.replace(/\d+%/, '') || budgetSaid;
+}
+
 function drawFigures() {
   const recent = seen.latencies.slice(-24).sort((a, b) => a - b);
   write('fps', state === 'playing' ? Math.round(fps()) : '–');
@@ -435,6 +450,7 @@ window.terrella = Object.freeze({
   get map() { return views.figures; },
   get done() { return !!(now.flags & DONE); },
   get latencies() { return [...seen.latencies]; },
+  get costs() { return costs; },
   get latencyCount() { return seen.latencyCount; },
   framesAfter: (seq) => seen.frames.filter((frame) => frame.seq > seq),
   drop: () => link.socket?.close(4999),
