@@ -32,6 +32,7 @@ from terrella.learn.recipes.policy import Practice
 from terrella.learn.trainer import TrainStep
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
+from terrella.worlds.controls import Controls
 
 NAME = "gym:tests.learn.test_imitation:TerrellaFetch-v0"
 QUICK = Practice(steps=150, batch=64, hidden=32, learning_rate=5e-3, save_every_s=1e9)
@@ -153,10 +154,10 @@ def test_actions_are_decoded_as_they_were_encoded():
         GymnasiumWorld("Pendulum-v1", rgb=False).spec,
         action=spaces.Box(np.array([-2.0, 0.0], np.float32), np.array([2.0, 1.0], np.float32)),
     )
-    assert torch.allclose(axes.decode(axes.encode(action), spec), action, atol=1e-4)
+    assert torch.allclose(axes.decode(Controls.of(spec).encode(action), spec), action, atol=1e-4)
     choice = ImitationConfig(ActorConfig((), "choice", (), (1.0,), (3.0,)))
-    spec = replace(spec, action=spaces.Discrete(3, start=1))
-    assert choice.decode(choice.encode(torch.tensor([1, 3, 2])), spec).tolist() == [1, 3, 2]
+    spec = replace(spec, action=spaces.Discrete(3, start=1), action_mode="choice")
+    assert choice.decode(Controls.of(spec).encode(torch.tensor([1, 3, 2])), spec).tolist() == [1, 3, 2]
 
 
 def test_a_batch_of_episodes_is_as_each_alone_and_keeps_its_history(fetch):
@@ -308,3 +309,9 @@ def test_a_policy_of_other_actions_or_channels_is_refused(fetch):
         train_imitation(recording, "unused", replace(QUICK, sees=("depth",)), Imitation(), quiet)
     with pytest.raises(TrainingError, match="at most the 1 actions"):
         train_imitation(recording, "unused", QUICK, Imitation(execute=2), quiet)
+
+
+def test_an_environment_of_other_actions_is_refused_before_training(fetch, tmp_path, capsys):
+    words = ["--from", str(fetch[1]), "--real", "gym:MountainCarContinuous-v0", "--out", str(tmp_path / "run")]
+    assert main(["train", "policy", "--method", "imitation", *words]) == 2
+    assert "it is for other actions" in capsys.readouterr().err and not (tmp_path / "run").exists()

@@ -43,6 +43,8 @@ def test_confidence_is_the_share_that_is_right():
     before, after = (calibration_error(one, right[2000:]) for one in (scores[2000:], calibration(scores[2000:])))
     assert before > 0.12 and after < 0.05
     assert 0 < calibration(np.array([0.0]))[0] < calibration(np.array([1.0]))[0] < 1
+    ties = Isotonic.fit(np.array([0, 0, 1, 1, 1]), np.array([0, 1, 0, 1, 1]))  # equal scores are one step
+    assert ties(np.array([0, 1])).tolist() == pytest.approx([2 / 4, 3 / 5])
     assert calibration_error(np.full(4, 0.5), np.array([0, 1, 0, 1])) == 0
 
 
@@ -101,6 +103,15 @@ def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, 
     assert all(f"\n{arm}" in text for arm in ("labelled only", "pseudo-labelled", "all labelled", "random"))
     assert main([*words, "--out", str(tmp_path / "x")]) == 2
     assert "--compare plays in an environment" in capsys.readouterr().err
+
+
+def test_labels_that_are_no_better_than_the_most_frequent_action_are_not_written(recording, tmp_path, capsys):
+    words = ["train", "inverse", str(recording), "--out", str(tmp_path / "run"), "--labelled", "0.2", *QUICK]
+    words[-1] = "wind"  # says nothing of the action
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("The labels are no better than always the most frequent action") and "next:" not in text
+    assert not (tmp_path / "run" / "recording").exists()
 
 
 class Slide(gymnasium.Env):

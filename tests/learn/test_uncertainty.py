@@ -14,6 +14,7 @@ from tests.space.rooms import CAMERA, painted, pose_at, room_depth
 from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, ObservationError
 from terrella.data import ClipCache, Dataset, Recorder, split
+from terrella.learn.calibration import pool_adjacent_violators
 from terrella.learn.objectives import uncertainty as uncertainty_module
 from terrella.learn.objectives.estimator import learn_estimator, recoloured, relative_motion
 from terrella.learn.objectives.uncertainty import (
@@ -24,7 +25,6 @@ from terrella.learn.objectives.uncertainty import (
     dream,
     expected_error,
     fit_uncertainty,
-    pool_adjacent_violators,
 )
 from terrella.learn.recipes import video
 from terrella.learn.recipes.parts import EstimatorTraining, SensesConfig, train_estimator, train_uncertainty

@@ -35,6 +35,7 @@ class ImitationConfig:
     chunk: int = 1  # actions that it predicts at once
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
+    differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
 
     @property
     def sees(self) -> tuple[str, ...]:
@@ -56,20 +57,9 @@ class ImitationConfig:
         if self.vocabulary and TEXT not in spec.channels:
             raise ChannelError(f"the policy follows instructions, and {spec.name} gives none (no channel '{TEXT}').")
 
-    def encode(self, action: torch.Tensor) -> torch.Tensor:
-        """Actions [N, *shape] as float32 [N, action_width]: choices one-hot, buttons as they are, axes scaled to -1..1."""
-        flat = action.reshape(len(action), -1).float()
-        low, high = (torch.tensor(limit, device=flat.device) for limit in (self.actor.low, self.actor.high))
-        if self.actor.mode == CHOICE:
-            whole = (flat - low).round().long()
-            parts = [F.one_hot(whole[:, n].clamp(0, count - 1), count) for n, count in enumerate(self.actor.counts)]
-            return torch.cat(parts, 1).float()
-        return (
-            flat if self.actor.mode == BUTTONS else (2 * (flat - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
-        )
-
     def decode(self, encoded: torch.Tensor, spec: Spec) -> torch.Tensor:
-        """The inverse of `encode`, in the space of `spec`: [N, *action.shape]."""
+        """Encoded actions [N, action_width] (choices one-hot, buttons 0 or 1, axes from -1 to 1) in the space of `spec`:
+        [N, *action.shape]."""
         if self.actor.mode == AXES:
             return self.actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
         if self.actor.mode == BUTTONS:
@@ -121,11 +111,18 @@ class _Look(nn.Module):
         return torch.relu(self.out(features.flatten(1)))
 
 
+def _deviation(numbers: torch.Tensor) -> torch.Tensor:
+    """The standard deviation [D] of numbers [N, D]; 1 where they never vary."""
+    spread = numbers.std(0, correction=0)
+    return torch.where(spread <= 1e-6, 1.0, spread)
+
+
 class ImitationNetwork(nn.Module):
     """`features` of each step's observation, and from those of the last steps the chunk of actions."""
 
     mean: torch.Tensor
     scale: torch.Tensor
+    change: torch.Tensor
 
     def __init__(self, config: ImitationConfig):
         super().__init__()
@@ -137,10 +134,14 @@ class ImitationNetwork(nn.Module):
         width = sum(count for _, count in self._vectors)
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("scale", torch.ones(width))
+        changes = 0
+        if config.differences:
+            self.register_buffer("change", torch.ones(width))
+            changes = (config.history - 1) * width
         self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
         self.width = width + actor.hidden * len(self.looks)
         acted = config.history * config.action_width if config.own_actions else 0
-        into = config.history * self.width + acted + words + (config.outcome is not None)
+        into = config.history * self.width + changes + acted + words + (config.outcome is not None)
         flow = actor.mode == AXES
         chunk = config.chunk * (config.action_width if flow else actor.outputs)
         self.trunk = mlp(into, actor.hidden, actor.layers, actor.hidden if flow else chunk, gain=1.0 if flow else 0.1)
@@ -150,18 +151,24 @@ class ImitationNetwork(nn.Module):
         """[N, width] of observations of N steps; words: the instruction as features [N, words]."""
         device, parts = self.mean.device, []
         if self._vectors:
-            flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
-            parts.append(symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG))
+            parts.append(self._numbers(seen))
         parts += [look(seen[name].to(device), words) for look, (name, _) in zip(self.looks, self._arrays)]
         return torch.cat(parts, 1)
 
+    def _numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        device = self.mean.device
+        flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
+        return symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG)
+
     def fit_normalization(self, seen: Mapping[str, torch.Tensor]) -> None:
-        """Takes mean and deviation from observations; numbers that never vary keep a deviation of 1."""
+        """Takes mean and deviation from observations [N * history, ...]; those that never vary keep 1."""
         if self._vectors:
             flat = torch.cat([seen[name].double().reshape(-1, count) for name, count in self._vectors], 1)
-            spread = flat.std(0, correction=0)
             self.mean.copy_(flat.mean(0))
-            self.scale.copy_(torch.where(spread <= 1e-6, 1.0, spread))
+            self.scale.copy_(_deviation(flat))
+            if self.config.differences:
+                changes = self._numbers(seen).view(-1, self.config.history, len(self.mean)).diff(dim=1)
+                self.change.copy_(_deviation(changes.flatten(0, 1)))
 
     def forward(
         self, history: torch.Tensor, acted: torch.Tensor, words: torch.Tensor | None, outcome: torch.Tensor | None
@@ -169,6 +176,8 @@ class ImitationNetwork(nn.Module):
         """From features [N, history, width], own actions [N, history, A], the instruction's features and the return that is asked
         for [N]: logits [N, chunk * outputs], or for axes the condition [N, hidden] of the flow."""
         parts = [history.flatten(1)]
+        if self.config.differences:
+            parts.append((history[..., : len(self.mean)].diff(dim=1) / self.change).flatten(1))
         parts += [acted.flatten(1)] if self.config.own_actions else []
         parts += [words] if words is not None else []
         parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []

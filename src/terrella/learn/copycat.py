@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..act.imitation_network import AXES, ImitationNetwork
+from ..act.imitation_network import AXES, ImitationConfig, ImitationNetwork
 from .demonstrations import DemonstrationRows
 from .objectives.imitation import condition
 
@@ -52,18 +52,25 @@ def copycat(network: ImitationNetwork, rows: DemonstrationRows, count: int) -> d
     figures = {name: round(value, 4) for name, value in figures.items()}
     nearer = (mine - last).square().sum(1) < (mine - truth).square().sum(1)
     copies = float(nearer[changes].float().mean()) if axes else _right(mine[changes], last[changes])
-    return {**figures, "copies_at_changes": round(copies, 4), "held_out_verdict": _verdict(figures, copies, axes)}
+    return {
+        **figures,
+        "copies_at_changes": round(copies, 4),
+        "held_out_verdict": _verdict(figures, copies, network.config),
+    }
 
 
-def _verdict(figures: dict[str, float], copies: float, axes: bool) -> str:
+def _verdict(figures: dict[str, float], copies: float, config: ImitationConfig) -> str:
+    axes = config.actor.mode == AXES
     right = "explains {:.0%} of the variance of" if axes else "predicts {:.0%} of"
     words = right.format(figures["held_out"]) + " the actions of held-out episodes"
     words += f" (copying the last: {figures['held_out_copy_last']:.0%})"
     words += f", and {figures['at_changes']:.0%} of those at which the teacher changes its action."
     if copies > (0.5 if axes else max(0.5, figures["at_changes"])):
-        return f"The policy copies its last action where the teacher changes it: it {words} Try --no-own-actions or --history 1."
+        fewer = "Try --no-own-actions." if config.own_actions else "Try --history 1." if config.history > 1 else ""
+        return f"The policy copies its last action where the teacher changes it: it {words} {fewer}".rstrip()
     if figures["held_out"] <= max(figures["held_out_copy_last"], figures["held_out_usual"]):
-        return f"The policy predicts no better than a copy of the last action or the most frequent one: it {words}"
+        usual = "the mean" if axes else "the most frequent one"
+        return f"The policy predicts no better than a copy of the last action or {usual}: it {words}"
     return f"The policy is more than a copy of its last action: it {words}"
 
 

@@ -51,7 +51,7 @@ class DemonstrationRows:
         if cache.action is None:  # clips: every row but an episode's last has an action that nobody recorded
             actions, valid = torch.zeros(cache.length, config.action_width), np.arange(cache.length) < stop - 1
         else:
-            actions = config.encode(torch.from_numpy(np.array(cache.action, np.float32)))
+            actions = recording.action(np.arange(cache.length))
             valid = np.array(cache.action_valid, bool).reshape(-1)
         rows, sure = np.flatnonzero(recording.usable & valid), cache.arrays.get(CONFIDENCE)
         if not len(rows):

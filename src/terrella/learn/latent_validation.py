@@ -14,7 +14,8 @@ from ..core.state import State
 from ..core.world import World, make_rng
 from ..worlds.latent import LatentWorld
 from ..worlds.latent_network import KNOTS
-from .objectives.uncertainty import isotonic, rank_correlation
+from .calibration import isotonic
+from .objectives.uncertainty import rank_correlation
 from .recording import Recording
 
 HORIZONS = (1, 8, 16)

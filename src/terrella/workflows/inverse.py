@@ -22,7 +22,7 @@ from ..exchange.formats.lerobot import LeRobotRows
 from ..learn.action_labels import decoded, labelled_source
 from ..learn.demonstrations import DemonstrationRows
 from ..learn.recipes import inverse as recipe
-from ..learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
+from ..learn.recipes.imitation import Imitation, config_of, open_demonstrations, train_imitation
 from ..learn.recipes.inverse import InverseDynamics, InverseTraining
 from ..learn.recipes.policy import Practice
 from ..learn.recording import Recording
@@ -64,6 +64,11 @@ class InverseResult:
     ]  # With --compare: the return of each arm and of random actions, in the real environment.
     share_of_oracle: float | None = None  # Gain over random of pseudo-labels, as a share of that of the true labels.
 
+    @property
+    def learned(self) -> bool:
+        """Whether the labels are better than always the most frequent action."""
+        return self.facts["label_accuracy"] > self.facts["usual_accuracy"]
+
     def to_json(self) -> dict[str, Any]:
         returns = {name: asdict(figure) for name, figure in self.returns.items()}
         return jsonable({**self.facts, "returns": returns, "share_of_oracle": self.share_of_oracle})
@@ -76,6 +81,11 @@ class InverseResult:
             f"The model names {model} of {facts['tested_labels']} actions of labelled episodes that it did not learn from "
             f"(the most frequent action alone: {usual}). Its confidence is off by {error} points (before calibration {raw})."
         ]
+        if not self.learned:
+            lines.insert(
+                0,
+                "The labels are no better than always the most frequent action: label more episodes, or train longer (--steps).",
+            )
         if "true_accuracy" in facts:
             lines.append(
                 f"Of the {facts['labels']} labels that it gave, {facts['true_accuracy']:.1%} are the recorded actions."
@@ -90,6 +100,8 @@ class InverseResult:
                 )
         if "recording" in facts:
             lines.append(f"the labelled recording: {facts['recording']}")
+        elif not self.returns:
+            lines.append("No labelled recording is written.")
         return "\n".join(lines)
 
 
@@ -108,6 +120,8 @@ def train_inverse(data: str | Path, config: InverseConfig, *, progress: Progress
     training, source = config.training, config.labels or data
     with stage("learning actions", progress) as report:
         opened, sees = open_demonstrations(source, training.sees, training.picture_size, report)
+        if real is not None:
+            config_of(opened, sees, training.hidden, Imitation(training.picture_size)).check(real.spec)
         labelled = _labelled(opened, config)
         inverse = recipe.train_inverse(opened, sees, labelled, config.out, training, report, config.device)
         clips = opened if config.labels is None else _clips(data, opened, sees, config, report)
@@ -122,6 +136,8 @@ def train_inverse(data: str | Path, config: InverseConfig, *, progress: Progress
         return InverseResult(facts, figures, gains[0] / gains[1] if gains[1] > 0 else None)
     out = Path(config.out) / "recording"
     shutil.rmtree(out, ignore_errors=True)  # of an earlier call
+    if not (result := InverseResult(facts, {})).learned:
+        return result
     made = labelled_source(clips, opened, decoded(actions, opened), sure)
     about = clips.dataset.features.get(clips.dataset.rgb_key or "", {}) if clips.dataset else {}
     pictures = "png" if about.get("dtype") == "image" else "video"  # exact ones stay exact

@@ -163,8 +163,9 @@ def _imitate(world: str | Path | None, config: TrainPolicyConfig, progress: Prog
         outside = config.environment.open(config.real)
     with stage("imitating", progress) as report:
         facts = imitation.train_imitation(
-            config.recording, config.out, config.practice, config.imitation, report, config.device
-        )
+            config.recording, config.out, config.practice, config.imitation, report, config.device,
+            spec=None if outside is None else outside.spec,
+        )  # fmt: skip
     if outside is None:
         return TrainPolicyResult(None, facts, None)
     trial = try_policy(config.out, None, outside, config.episodes, config.practice.seed, progress)

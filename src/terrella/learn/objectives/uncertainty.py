@@ -34,6 +34,7 @@ from ...worlds.uncertainty import (
     input_maps,
     situation_of,
 )
+from ..calibration import isotonic
 from ..feeds import RandomBatches
 from ..recording import Recording
 from ..run_folder import resume_file
@@ -312,29 +313,6 @@ def _raw_error(uncertainty: UncertaintyNetwork, seen: DreamFrames) -> torch.Tens
     """The expected error before calibration [N]."""
     parts = torch.arange(len(seen.error)).split(256)
     return torch.cat([uncertainty(seen.clues[part].float(), seen.situation[part]).mean((1, 2)) for part in parts])
-
-
-def isotonic(values: torch.Tensor, errors: torch.Tensor, bins: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Isotonic regression of errors [N] on values [N], in bins of equally many: mean value and fitted error of each [bins], the
-    last repeated where there are fewer than `bins` values."""
-    parts = [part for part in np.array_split(values.argsort().numpy(), bins) if len(part)]
-    knots = [float(values[part].mean()) for part in parts]
-    fitted = pool_adjacent_violators([float(errors[part].mean()) for part in parts], [len(part) for part in parts])
-    lacking = bins - len(parts)
-    return torch.tensor(knots + knots[-1:] * lacking), torch.tensor(fitted + fitted[-1:] * lacking)
-
-
-def pool_adjacent_violators(values: list[float], weights: list[float]) -> list[float]:
-    """The ascending sequence nearest to `values` in weighted least squares (Ayer et al. 1955)."""
-    blocks: list[list[float]] = []  # mean, weight, count
-    for value, weight in zip(values, weights, strict=True):
-        blocks.append([value, weight, 1])
-        while len(blocks) > 1 and blocks[-2][0] >= blocks[-1][0]:
-            mean, heavy, count = blocks.pop()
-            below = blocks[-1]
-            total = below[1] + heavy
-            blocks[-1] = [(below[0] * below[1] + mean * heavy) / total, total, below[2] + count]
-    return [mean for mean, _, count in blocks for _ in range(int(count))]
 
 
 def _exponential_nll(expected: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

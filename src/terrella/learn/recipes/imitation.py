@@ -17,7 +17,7 @@ from ...act.imitation import ImitationActor
 from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork
 from ...act.sentences import vocabulary_of
 from ...core.errors import DatasetError, TrainingError
-from ...core.spec import kind_of
+from ...core.spec import Spec, kind_of
 from ...data import Dataset
 from ...data.channels import ESTIMATES
 from ...data.training.cache import array_for
@@ -68,19 +68,23 @@ def train_imitation(
     report: Report,
     device: str = "auto",
     relabel: Callable[[DemonstrationRows], DemonstrationRows] = lambda rows: rows,
+    spec: Spec | None = None,
 ) -> dict[str, Any]:
     """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
-    verdict on held-out episodes. relabel: which rows are learned from, with what actions. DatasetError or TrainingError for what
-    cannot be imitated."""
+    verdict on held-out episodes. relabel: which rows are learned from, with what actions. spec: where it is to act. DatasetError
+    or TrainingError for what cannot be imitated, ActionError or ChannelError if it could not act there."""
     out, batch = Path(out), practice.batch or 256
     _check(practice, imitation)
     opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
+    config = config_of(opened, sees, practice.hidden, imitation)
+    if spec is not None:
+        config.check(spec)
     settings = {**asdict(imitation), "recording": str(recording)}
     run = Run.of(out, practice, report, device_named(device), ("minutes",), **settings)
     run.saved_facts(STAGE)
     torch.manual_seed(practice.seed)
-    network = ImitationNetwork(config_of(opened, sees, practice.hidden, imitation)).to(run.device)
-    rows = relabel(DemonstrationRows.of(opened, network.config, run.device))
+    network = ImitationNetwork(config).to(run.device)
+    rows = relabel(DemonstrationRows.of(opened, config, run.device))
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
     objective = BehaviourCloning(network, practice.learning_rate)
     feed = RandomBatches(lambda now: rows.sample(batch, now.rng))
