@@ -55,7 +55,7 @@ class Carousel:
         for name in channels:
             kind, _, suffix = name.partition(".")
             if kind == "reward":
-                shown[name] = torch.zeros(state.batch)
+                shown[name] = state["heading"].float()
                 continue
             pose = turned(state["heading"] + YAWS[f"rgb.{suffix}" if suffix else "rgb"])
             if kind == "pose":
@@ -109,6 +109,7 @@ def test_a_world_of_three_cameras_is_learned_saved_and_plays(recorded, tmp_path)
         24,
         3,
     )
+    assert world.outcome.config.side == 3 * 64, "its outcome sees each picture as large as that of a single camera"
     given = {name: torch.full((1, *SIZE, 3), value, dtype=torch.uint8) for value, name in enumerate(world.cameras)}
     state = world.observe(given, None, make_rng(0))
     shown = world.render(state, ("rgb.right", "rgb"))

@@ -51,16 +51,20 @@ class Happenings:
         return bool(self.names) or bool(np.ptp(self.reward[self.real])) or bool(self.done[self.real].any())
 
     def events(self) -> np.ndarray:
-        """bool [N]: steps with an unusual reward, a termination or a change of vitals."""
-        usual = np.median(self.reward[self.real])
-        return self.real & ((self.reward != usual) | self.done | (self.change != 0).any(1))
+        """bool [N]: steps with a termination, a change of vitals or, where most rewards are the same, another reward."""
+        unusual = self.reward != np.median(self.reward[self.real])
+        if unusual[self.real].mean() > 0.5:  # rewards vary all the time
+            unusual = np.zeros_like(self.done)
+        return self.real & (unusual | self.done | (self.change != 0).any(1))
 
-    def config(self) -> OutcomeConfig:
+    def config(self, cameras: int = 1) -> OutcomeConfig:
+        """Of frames in which the pictures of this many cameras lie side by side."""
         changes = tuple(levels(self.change[self.real, column]) for column in range(len(self.names)))
         spans = tuple(
             float(max(np.abs(self.vitals[self.real, column]).max(), 1e-6)) for column in range(len(self.names))
         )
-        return OutcomeConfig(self.action.shape[1], levels(self.reward[self.real]), self.names, changes, spans)
+        rewards, side = levels(self.reward[self.real]), OutcomeConfig.side * cameras
+        return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, spans, side=side)
 
 
 def levels(values: np.ndarray) -> tuple[float, ...]:

@@ -49,7 +49,8 @@ class VideoParts:
         if self.happened.is_informative and (video.moving or not video.geometry):
             begins = _first_vitals(self.happened.vitals, recording)
             video = replace(video, vitals=begins)
-            self.outcome = FrameOutcome(replace(self.happened.config(), begins=begins)).to(run.device)
+            outcome = replace(self.happened.config(len(recording.cameras) or 1), begins=begins)
+            self.outcome = FrameOutcome(outcome).to(run.device)
         self.video = video
 
     def outcome_stages(self) -> list[Stage]:
