@@ -15,7 +15,7 @@ from terrella.data import ClipCache, Recorder
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, controls_of
-from terrella.learn.trainer import Run
+from terrella.learn.trainer import Run, TrainStep
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world
 from terrella.worlds.frame_history import FrameHistory, StartClips
@@ -112,6 +112,28 @@ def test_rewards_that_vary_all_the_time_are_no_events(learned):
     varied = replace(happened, reward=np.random.default_rng(0).random(len(happened.real)).astype(np.float32))
     without = replace(happened, reward=np.zeros_like(happened.reward))
     assert np.array_equal(varied.events(), without.events()) and 0 < varied.events().mean() < 0.5
+
+
+@pytest.mark.parametrize("followed", [0.0, 1.0])
+def test_clips_go_on_with_vitals_of_their_own_and_learn_to_correct_them(learned, monkeypatch, followed):
+    _, seen, happened, _ = learned
+    always = replace(happened.config(), changes=((-1.0, 0.0),))
+    outcome = FrameOutcome(always)
+    torch.nn.init.constant_(outcome.changed[0].weight, 0.0)
+    outcome.changed[0].bias = torch.nn.Parameter(torch.tensor([50.0, -50.0]))  # a life is lost at every step
+    steady = replace(happened, change=np.zeros_like(happened.change), vitals=np.full_like(happened.vitals, 3.0))
+    targets = []
+
+    def noted(config, predicted, ends, reward, done, change):
+        targets.append(change[:, 0])
+        return ends
+
+    monkeypatch.setattr("terrella.learn.objectives.outcome.FOLLOWED", followed)
+    monkeypatch.setattr("terrella.learn.objectives.outcome.negative_log_likelihood", noted)
+    objective = OutcomeObjective(outcome, seen.rgb, steady, batch=2)
+    now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
+    list(objective.losses(objective.sample(now), now))
+    assert [change.tolist() for change in targets] == [[followed * step] * 2 for step in range(len(targets))]
 
 
 @pytest.mark.slow

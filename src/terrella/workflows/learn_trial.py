@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ..core.errors import DatasetError, TerrellaError, TrainingError
-from ..core.world import World
+from ..core.world import World, make_rng
 from ..data import RecordOptions
 from ..learn.recipes.video import TrainConfig, TrainingPace, time_training
 from .collect import explore, storage_of
@@ -37,6 +37,7 @@ class Pace:
 def time_environment(world: World, seed: int, config: TrainConfig) -> Pace | None:
     """Records a few frames in a temporary folder and takes a few training steps on them; None where so few cannot be trained
     on, as of a very slow game."""
+    world.render(world.start(1, make_rng(seed)), list(world.spec.channels))  # the first takes longer than those to come
     with TemporaryDirectory() as folder:
         began, rows = time.monotonic(), 1
 

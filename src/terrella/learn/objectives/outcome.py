@@ -15,6 +15,7 @@ from ..feeds import RandomBatches
 from ..trainer import Learner, Loss, Run, Trainer, TrainStep, warmup_cosine
 
 LENGTH = 8  # steps of a clip
+FOLLOWED = 0.5  # the part of the clips that go on with their own vitals, as in play, and learn to correct them
 _LEVELS = 33  # values at most into which rewards and changes are discretised
 
 
@@ -130,8 +131,11 @@ class OutcomeObjective:
         names = ("action", "reward", "done", "change", "vitals")
         at = {name: torch.from_numpy(getattr(happened, name)[rows]).float().to(device) for name in names}
         hidden, total = outcome.begin(len(starts)).to(device), torch.zeros((), device=device)
+        own, follows = at["vitals"][:, 0], now.rand(len(starts), 1) < FOLLOWED
         for step in range(LENGTH):
-            vitals, change = at["vitals"][:, step], at["change"][:, step]
+            recorded = at["vitals"][:, step]
+            vitals = torch.where(follows, own, recorded)
+            change = recorded + at["change"][:, step] - vitals
             predicted = outcome.judge(seen[:, step], at["action"][:, step], vitals, hidden)
             hidden = predicted.hidden
             ends = outcome.ends(predicted.known, vitals + change)
@@ -139,7 +143,17 @@ class OutcomeObjective:
                 outcome.config, predicted, ends, at["reward"][:, step], at["done"][:, step], change
             )
             total = total + (weight.to(device) * error).mean() / LENGTH
+            own = vitals + self._drawn(predicted, now)
         yield Loss("outcome", total, {"outcome": total})
+
+    def _drawn(self, predicted: OutcomeLogits, now: TrainStep) -> torch.Tensor:
+        """Changes [B, V] of the vitals, drawn from what is predicted."""
+        drawn = [predicted.hidden.new_zeros(len(predicted.hidden), 0)]
+        for logits, values in zip(predicted.changes, self.outcome.config.changes):
+            upto = logits.detach().float().softmax(1).cumsum(1)
+            pick = (upto < now.rand(len(upto), 1)).sum(1, keepdim=True).clamp_max(len(values) - 1)
+            drawn.append(torch.tensor(values, device=upto.device)[pick])
+        return torch.cat(drawn, 1)
 
 
 def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:

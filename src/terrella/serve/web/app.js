@@ -193,7 +193,7 @@ function able(button, why, title) {
 }
 
 /** How a number is called: events are counted. */
-function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) && !/(n|ed)$/.test(name) ? 's' : ''); }
+function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) && !/(n|d)$/.test(name) ? 's' : ''); }
 
 /** What a number means; '' where its name says it. */
 function explained(name) {
