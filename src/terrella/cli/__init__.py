@@ -51,6 +51,7 @@ COMMANDS = {
     "score": ("score:score", "compare a world's predictions with a recording"),
     "check": ("physics:check", "check which laws of physics a world's predictions keep"),
     "space fit": ("space:fit", "fit a place of Gaussians to a recording, photographs or a video"),
+    "space lift": ("space:lift", "make a place to walk in from one picture"),
     "space build": ("space:build", "build a place to walk in from a sentence or a layout of rooms and furniture"),
     "space import": ("space:import_", "import a file of another tool as a world (.ply, .spz, .sog, .glb)"),
     "space export": ("space:export", "write a world's Gaussians for other tools, or as a page to walk in"),

@@ -16,6 +16,7 @@ from ..workflows.build_space import (
 )
 from ..workflows.edit_space import EditSpaceConfig, edit_space
 from ..workflows.export_space import ExportSpaceConfig, export_space
+from ..workflows.lift_space import LiftSpaceConfig, lift_space
 from ..workflows.results import command
 from ..workflows.splat_places import editable_place
 from .say import Host, Json, PlaceName, Port, RecordingName, Token, opened, say, show
@@ -50,6 +51,19 @@ def build(
         out: Folder of the world.
     """
     show(build_space(source, out, config), json, _viewing(out))
+
+
+def lift(
+    picture: Annotated[Path, Positional, arg(metavar="PICTURE")], out: Path, config: LiftSpaceConfig, json: Json = False
+) -> None:
+    """Make a place to walk in from one picture: a photograph, a drawing, a game's screenshot. A network estimates depth, lens, and
+    what lies behind edges.
+
+    Args:
+        picture: The picture: JPEG, PNG, WebP, GIF (its first frame), TIFF or BMP.
+        out: Folder of the world.
+    """
+    show(lift_space(picture, out, config), json, _viewing(out))
 
 
 def import_(

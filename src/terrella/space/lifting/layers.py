@@ -1,0 +1,215 @@
+"""A picture as two layers of depth, and these as Gaussians: what is seen, and behind its edges what is not."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+
+from ..camera import Intrinsics, rays
+from ..raster import Gaussians, join
+from ..raster.gaussians import plain_sh
+from ..raster.move import quaternion_of
+from .network import MULTIPLE, LayerCodes, Lifter
+from .scenes import rotation_of
+
+SIGMA = 0.62  # standard deviation of a Gaussian as a share of its pixel's width
+OPACITY, THIN = 0.97, 0.15
+STEEPEST = 5.0  # a pixel's Gaussian is at most this much longer than wide
+EDGE = 0.06  # steps of the logarithm of depth that are edges
+HIDES = 0.35  # the probability from which a hidden surface is made
+MIRROR = torch.tensor([1.0, 1.0, -1.0, 1.0])  # the view in a mirror: roll turns the other way
+FEWEST_FLOOR = 0.01  # share of pixels that make a floor
+
+
+@dataclass(frozen=True)
+class PictureLayers:
+    """Two layers of a picture of H x W pixels by a camera `height_m` above the floor that is tilted by pitch and roll (radians)."""
+
+    rgb: torch.Tensor  # [3, H, W] in 0..1
+    depth: torch.Tensor  # [H, W] metres along the optical axis
+    behind: torch.Tensor  # [h, w], half of that: depth of the hidden layer
+    hides: torch.Tensor  # [h, w], the probability that it shows from near the camera
+    behind_rgb: torch.Tensor  # [3, h, w]
+    error: torch.Tensor  # [H, W], the expected error of depth, as a share of it
+    focal: float  # in longer sides of the picture
+    pitch: float
+    roll: float
+    height_m: float
+
+    @property
+    def camera(self) -> Intrinsics:
+        height, width = self.depth.shape
+        long = self.focal * max(height, width)
+        return (long / width, long / height, 0.5, 0.5)
+
+    @property
+    def turn(self) -> torch.Tensor:
+        """[3, 3], camera to world; the camera looks along x."""
+        return torch.from_numpy(rotation_of(0.0, self.pitch, self.roll)).float()
+
+    @property
+    def pose(self) -> torch.Tensor:
+        """T_world_cam [7], with the floor at 0."""
+        return torch.cat([torch.tensor([0.0, 0.0, self.height_m]), quaternion_of(self.turn)])
+
+
+@torch.inference_mode()
+def layers_of(
+    picture: np.ndarray, lifter: Lifter, focal: float | None = None, height_m: float | None = None
+) -> PictureLayers:
+    """The layers of a picture uint8 [H, W, 3]. focal: of its lens in longer sides, and height_m: of the camera, if known."""
+    height, width = picture.shape[:2]
+    rgb = torch.from_numpy(np.array(picture)).permute(2, 0, 1).float() / 255
+    share = lifter.config.longest / max(height, width)
+    small = tuple(max(round(side * share), MULTIPLE) for side in (height, width))
+    shrunk = Image.fromarray(picture).resize(
+        small[::-1], Image.Resampling.BOX if share < 1 else Image.Resampling.BICUBIC
+    )
+    seen = torch.from_numpy(np.array(shrunk)).permute(2, 0, 1).float()[None] / 255
+    codes = _codes(lifter, seen)
+    log_focal, pitch, roll, log_height = (float(part) for part in codes.lens[0])
+    focal = focal or math.exp(min(max(log_focal, math.log(0.35)), math.log(1.6)))
+    near = _sharpened(codes.near[0], seen[0], rgb)
+    spread = F.interpolate(codes.spread[None], (height, width), mode="bilinear")[0, 0]
+    half = (-(-height // 2), -(-width // 2))
+    step, hides, behind_rgb = (
+        F.interpolate(part, half, mode="bilinear")[0]
+        for part in (codes.step[None], codes.hides[None].sigmoid(), codes.rgb)
+    )
+    depth = near.exp() * focal
+    given = (rgb, depth, depth[::2, ::2] * step[0].exp(), hides[0], behind_rgb, spread.exp())
+    layers = PictureLayers(*given, focal, pitch, roll, math.exp(log_height))
+    layers = replace(layers, height_m=floor_height(layers) or layers.height_m)
+    if height_m is None:
+        return layers
+    scale = height_m / layers.height_m
+    return replace(layers, depth=scale * layers.depth, behind=scale * layers.behind, height_m=height_m)
+
+
+def _codes(lifter: Lifter, seen: torch.Tensor) -> LayerCodes:
+    """The codes of a picture [1, 3, H, W], and of its mirror image, averaged."""
+    height, width = seen.shape[-2:]
+    more = [-side % MULTIPLE for side in (height, width)]
+    top, left = more[0] // 2 & ~1, more[1] // 2 & ~1
+    pad = (left, more[1] - left, top, more[0] - top)
+    whole = F.pad(seen, pad, mode="replicate")
+    one = lifter(torch.cat([whole, whole.flip(-1)]))
+    flipped = [(part[:1] + part[1:].flip(-1)) / 2 for part in one[:5]]
+    lens = (one.lens[:1] + one.lens[1:] * MIRROR) / 2
+    first = [part[..., top : top + height, left : left + width] for part in flipped[:2]]
+    rows, columns = slice(top // 2, top // 2 - (-height // 2)), slice(left // 2, left // 2 - (-width // 2))
+    step, hides, rgb = (part[..., rows, columns] for part in flipped[2:])
+    return LayerCodes(first[0], first[1], step, hides, rgb, lens)
+
+
+def _sharpened(near: torch.Tensor, small: torch.Tensor, rgb: torch.Tensor) -> torch.Tensor:
+    """Logarithms of depth [h, w] at the size of the picture `rgb` [3, H, W]: interpolated as planes are, and at edges taken from
+    those neighbours whose colours in the picture `small` [3, h, w] are like the pixel's."""
+    height, width = rgb.shape[-2:]
+    wide = max(near.shape) / max(height, width)
+    plain = -F.interpolate((-near).exp()[None, None], (height, width), mode="bilinear")[0, 0].log()
+    reach = F.max_pool2d(near[None, None], 3, 1, 1) + F.max_pool2d(-near[None, None], 3, 1, 1)
+    edges = F.interpolate((reach > EDGE).float(), (height, width), mode="nearest")[0, 0] > 0
+    row, column = edges.nonzero(as_tuple=True)
+    at = [((part + 0.5) * wide - 0.5) for part in (row, column)]
+    base = [part.round().long() for part in at]
+    weights, values = [], []
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            a, b = (base[0] + i).clamp(0, near.shape[0] - 1), (base[1] + j).clamp(0, near.shape[1] - 1)
+            apart = (at[0] - a).square() + (at[1] - b).square()
+            unlike = (small[:, a, b] - rgb[:, row, column]).square().sum(0)
+            weights.append((-apart / 0.8 - unlike / 0.008).exp() + 1e-9 * (-apart).exp())
+            values.append(near[a, b])
+    weight, value = torch.stack(weights), torch.stack(values)
+    best = value.gather(0, weight.argmax(0, keepdim=True))
+    weight = weight * ((value - best).abs() < EDGE)
+    plain[row, column] = (weight * value).sum(0) / weight.sum(0)
+    return plain
+
+
+def floor_height(layers: PictureLayers) -> float | None:
+    """The height of the camera above the lowest level surface that fills enough of the picture, if there is one: metres."""
+    points = _points(layers.depth, layers) @ layers.turn.T
+    normal = torch.cross(points.diff(dim=1)[:-1], points.diff(dim=0)[:, :-1], dim=-1)
+    level = normal[..., 2].abs() > 0.94 * normal.norm(dim=-1)
+    down = -points[:-1, :-1, 2]
+    deep = down[level & (down > 0.15)]
+    if len(deep) < FEWEST_FLOOR * down.numel():
+        return None
+    counts = torch.histc(deep.log(), 60, math.log(0.15), math.log(6.0))
+    counts = F.avg_pool1d(F.pad(counts[None], (1, 1)), 3, 1)[0]
+    enough = (counts > max(0.35 * float(counts.max()), 0.3 * FEWEST_FLOOR * down.numel())).nonzero()[:, 0]
+    if not len(enough):
+        return None
+    edges = torch.linspace(math.log(0.15), math.log(6.0), 61).exp()
+    low, high = float(edges[max(int(enough[-1]) - 1, 0)]), float(edges[min(int(enough[-1]) + 2, 60)])
+    return float(deep[(deep >= low) & (deep <= high)].median())
+
+
+def _points(depth: torch.Tensor, layers: PictureLayers) -> torch.Tensor:
+    """[h, w, 3] in the camera's frame."""
+    return depth[..., None] * rays(layers.camera, *depth.shape)
+
+
+def to_gaussians(layers: PictureLayers, two: bool = True) -> tuple[Gaussians, torch.Tensor]:
+    """The Gaussians of a picture, and which were seen: bool [N]. Of the hidden layer (if `two`) only what shows once the camera
+    moves. Each covers its pixel, tilted as the surface is."""
+    first = _of_pixels(layers.depth, layers.rgb, torch.ones_like(layers.depth, dtype=torch.bool), layers)
+    if not two:
+        return first, torch.ones(len(first), dtype=torch.bool)
+    more = _of_pixels(layers.behind, layers.behind_rgb, layers.hides > HIDES, layers)
+    return join([first, more]), torch.arange(len(first) + len(more)) < len(first)
+
+
+def _of_pixels(depth: torch.Tensor, rgb: torch.Tensor, some: torch.Tensor, layers: PictureLayers) -> Gaussians:
+    """One Gaussian for each pixel of `some` [h, w]."""
+    points, camera = _points(depth, layers), layers.camera
+    width = (depth / (camera[0] * depth.shape[1]))[..., None]
+    across, along = (_slope(points, depth, axis) for axis in (1, 0))
+    across = torch.where(across.norm(dim=-1, keepdim=True) > 0, across, width * torch.tensor([0.0, -1.0, 0.0]))
+    along = torch.where(along.norm(dim=-1, keepdim=True) > 0, along, width * torch.tensor([0.0, 0.0, -1.0]))
+    turn = layers.turn
+    across, along, points = across[some] @ turn.T, along[some] @ turn.T, points[some] @ turn.T
+    one = F.normalize(across, dim=1)
+    normal = F.normalize(torch.linalg.cross(one, along), dim=1)
+    two = torch.linalg.cross(normal, one)
+    size, thick = width[some][:, 0], torch.ones(len(points))
+    first = across.norm(dim=1).clamp(max=STEEPEST).minimum(STEEPEST * size)
+    second = (along * two).sum(1).abs().minimum(STEEPEST * size)
+    scales = SIGMA * torch.stack([first.maximum(size), second.maximum(size), THIN * size * thick], 1)
+    quats = _quaternions(torch.stack([one, two, normal], 2))
+    means = points + torch.tensor([0.0, 0.0, layers.height_m])
+    colours = rgb[:, some].T
+    return Gaussians(means, quats, scales, torch.full((len(means),), OPACITY), plain_sh(colours))
+
+
+def _slope(points: torch.Tensor, depth: torch.Tensor, axis: int) -> torch.Tensor:
+    """From each pixel to the next along an axis on the same surface [h, w, 3]; zeros where its neighbours lie on others."""
+    step, log = points.diff(dim=axis), depth.log().diff(dim=axis).abs()
+    same = (log < EDGE)[..., None].float()
+    pad = (0, 0, 0, 0, 1, 0) if axis == 0 else (0, 0, 1, 0)
+    after = (0, 0, 0, 0, 0, 1) if axis == 0 else (0, 0, 0, 1)
+    total = F.pad(step * same, pad) + F.pad(step * same, after)
+    return total / (F.pad(same, pad) + F.pad(same, after)).clamp_min(1)
+
+
+def _quaternions(frames: torch.Tensor) -> torch.Tensor:
+    """Rotations [N, 3, 3] as quaternions w, x, y, z [N, 4]."""
+    m = frames
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    squares = torch.stack([1 + trace, *(1 + 2 * m[:, k, k] - trace for k in range(3))], 1)
+    rows = torch.stack(
+        [
+            torch.stack([squares[:, 0], m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], 1),
+            torch.stack([m[:, 2, 1] - m[:, 1, 2], squares[:, 1], m[:, 1, 0] + m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0]], 1),
+            torch.stack([m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] + m[:, 0, 1], squares[:, 2], m[:, 2, 1] + m[:, 1, 2]], 1),
+            torch.stack([m[:, 1, 0] - m[:, 0, 1], m[:, 0, 2] + m[:, 2, 0], m[:, 2, 1] + m[:, 1, 2], squares[:, 3]], 1),
+        ],
+        1,
+    )
+    best = squares.argmax(1)
+    return F.normalize(rows[torch.arange(len(m)), best], dim=1)
