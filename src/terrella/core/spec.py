@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -203,6 +204,23 @@ def trust_channel(spec: Spec) -> str:
     """The channel whose value ends what is imagined, where it is above a limit: `invented`, for a position drifts under every plan
     alike; the whole `uncertainty` in worlds that do not tell its parts apart."""
     return "invented" if "invented" in spec.channels else "uncertainty"
+
+
+def chance_error(spec: Spec) -> float:
+    """The error of a random observation of the world, in the unit of its `uncertainty`: for pictures by its card, for latents the
+    square root of 2. NaN where the world has no `uncertainty`, or does not say."""
+    card = spec.card.get("uncertainty")
+    ceiling = card.get("ceiling") if isinstance(card, Mapping) else None
+    if "uncertainty" not in spec.channels:
+        return math.nan
+    if isinstance(ceiling, int | float) and 0 < ceiling <= 1:
+        return float(ceiling)
+    return math.sqrt(2) if "latent" in spec.channels else math.nan
+
+
+def trust_level(first: float, chance: float) -> float:
+    """The error at which trust in a rollout ends: a quarter of the way from `first`, that of its first step, to `chance`."""
+    return first + 0.25 * max(chance - first, 0.0)
 
 
 def neutral_action(spec: Spec) -> np.ndarray:

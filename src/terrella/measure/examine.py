@@ -23,6 +23,7 @@ from .scorecard import Missing, PlaceSummary, Scorecard
 from .speed import SPEED
 from .states import STATES
 from .states import series as state_series
+from .trust import TRUST
 from .verdict import to_json
 from .work_units import Calls, Clock, Forecast, Progress, Store, prices_of, run_all, writing
 
@@ -34,6 +35,7 @@ PROBES: tuple[Probe, ...] = (
     POSES,
     DRIFT,
     CALIBRATION,
+    TRUST,
     OUTCOMES,
     MEMORY,
     STILLNESS,

@@ -9,7 +9,7 @@ import torch
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ..core.errors import ServeError
-from ..core.spec import Spec
+from ..core.spec import Spec, chance_error, trust_level
 
 FORMATS = ("JPEG", "PNG", "WEBP", "GIF", "BMP", "TIFF", "PPM")  # a small part of what Pillow can read
 MAX_FILE = 2**26  # bytes of a file
@@ -68,16 +68,19 @@ def strip_of(pictures: torch.Tensor, height: int = 72) -> str:
     return base64.b64encode(data.getvalue()).decode()
 
 
-def uncertainty_levels(spec: Spec) -> tuple[float, float, float] | None:
-    """For a world with the channel `uncertainty`: its usual value; that above which most of the picture is invented; and that by
-    drift above which the position is lost, half of what two random pictures of the world differ by."""
+def uncertainty_levels(spec: Spec) -> tuple[float, float, float, float] | None:
+    """For a world with the channel `uncertainty`: its usual value; that above which most of the picture is invented; that by drift
+    above which the position is lost, half of what two random pictures of the world differ by; and that beyond which it is not to be
+    trusted. Latents differ by 1 from their mean."""
     if "uncertainty" not in spec.channels:
         return None
+    if "latent" in spec.channels:
+        return 0.05, 0.7, 0.7, trust_level(0.05, chance_error(spec))
     card = spec.card.get("uncertainty")
     levels = card if isinstance(card, dict) else {}
     usual = ("sure", 0.02), ("invents", 0.08), ("ceiling", 0.2)
     sure, invents, ceiling = (_share(levels.get(name), value) for name, value in usual)
-    return sure, max(invents, 1.01 * sure), ceiling / 2
+    return sure, max(invents, 1.01 * sure), ceiling / 2, trust_level(sure, ceiling)
 
 
 def _share(value: object, usual: float) -> float:

@@ -36,6 +36,7 @@ from .opening import Device, EnvironmentConfig, device_of, load_named
 from .place_goals import WALK_S, PlaceGoals, is_recording, views_of, walking_defaults
 from .progress import Progress, stage
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
+from .trust import search_within_trust
 
 WITHIN = 0.05  # default distance at which a goal is reached, where it is no place
 
@@ -233,6 +234,7 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
     whole = config.search.filled().horizon
     search = config.search.filled(replan=whole) if config.cost == "last" else config.search.filled()
     if config.agent is None:
+        search = search_within_trust(world, search, progress)
         planner_of(world, goal, config, search)  # refuses what does not fit, before anything is played
     return PlanStudy(config, search, world, real, goal, _criterion(config, goal, real.spec), limit or STEPS, progress)
 

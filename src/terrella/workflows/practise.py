@@ -36,6 +36,7 @@ from .opening import Device, EnvironmentConfig, device_of
 from .progress import Progress, Report, silent, stage, stopping_with
 from .results import jsonable
 from .train_policy import PolicyTrial, try_policy
+from .trust import practice_within_trust
 
 ROUNDS = 4
 COLLECTING, LEARNING, PRACTISING = "collecting", "learning the world", "practising"
@@ -236,6 +237,7 @@ def _round(
             practice = replace(practice, batch=BATCH)
         else:
             practice = replace(practice, method="ppo", cautious=True, trust=TRUST)
+        practice = practice_within_trust(world, practice, progress)
         transferable = number and "latent" not in default_channels(world.spec)  # another world has other latents
         earlier = rounds.policy(best_round([*done, notes])) if transferable else None
         facts = train_policy(world, name, rounds.policy(number), practice, report, rounds.recording, earlier)

@@ -27,6 +27,7 @@ from .opening import Device, EnvironmentConfig, load_named
 from .progress import Progress, silent, stage
 from .real_environment import STEPS, check_alike, open_copied, open_real, refuse_randomised
 from .results import changed_settings, jsonable
+from .trust import practice_within_trust
 
 IMITATED_WITH = ("sees", "minutes", "steps", "batch", "hidden", "learning_rate", "save_every_s", "seed")
 
@@ -139,8 +140,9 @@ def train_policy(
     if outside is not None:
         check_alike(inside.spec, outside.spec)
     growing = cast(Scaled, inside) if config.grow else None
+    practice = practice_within_trust(inside, config.practice, progress)
     with stage("practising", progress) as report:
-        facts = recipe.train_policy(inside, world, out, config.practice, report, config.recording, growing=growing)
+        facts = recipe.train_policy(inside, world, out, practice, report, config.recording, growing=growing)
     if outside is None:
         return TrainPolicyResult(world, facts, None)
     trial = try_policy(out, inside, outside, config.episodes, config.practice.seed, progress)

@@ -83,6 +83,12 @@ class PracticeSettings(Practice):
         return PracticeSettings(**({"horizon": 24, "entropy": 2e-3} if ppo else {}) | given)
 
 
+def settings_in(world: World, practice: Practice) -> tuple[PracticeSettings, bool]:
+    """The settings with which a policy practises in this world, and whether it does by ppo."""
+    ppo = (practice.method or ("ppo" if world.spec.card.get("together") else "actor-critic")) == "ppo"
+    return PracticeSettings.of(practice, ppo), ppo
+
+
 def train_policy(
     world: World,
     name: str,
@@ -100,8 +106,7 @@ def train_policy(
     TrainingError for what cannot be trained.
     """
     spec, out = world.spec, Path(out)
-    ppo = (practice.method or ("ppo" if spec.card.get("together") else "actor-critic")) == "ppo"
-    config = PracticeSettings.of(practice, ppo)
+    config, ppo = settings_in(world, practice)
     _check(config)
     check_practised(spec)
     sees = config.sees or default_channels(spec)

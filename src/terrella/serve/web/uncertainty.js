@@ -8,8 +8,8 @@ export class Uncertainty {
     this.limits = null;
   }
 
-  /** [the error that is usual for this world, that from which it invents, that by drift from which the position is lost]; null
-   *  where it does not say. */
+  /** [the error that is usual for this world, that from which it invents, that by drift from which the position is lost, that beyond
+   *  which it is not to be trusted]; null where it does not say. */
   set levels(limits) {
     this.limits = limits;
     this.value = -1;
@@ -20,21 +20,24 @@ export class Uncertainty {
    *  the rest is invention. `now`: without easing. */
   show(error, drifted, now) {
     if (!this.limits || error < 0) return;
-    const [usual, high, lost] = this.limits, first = now || this.value < 0, ease = (from, to) => first ? to : from + 0.15 * (to - from);
+    const [usual, high, lost, trusted] = this.limits, first = now || this.value < 0, ease = (from, to) => first ? to : from + 0.15 * (to - from);
     this.value = ease(this.value, error - drifted);
     this.drifted = ease(this.drifted, drifted);
     const bound = this.level === 'high' ? 0.85 : 1;  // a level is left later than it is entered: no flicker
     this.level = this.value >= bound * high ? 'high' : this.value >= usual + bound * 0.4 * (high - usual) ? 'medium' : 'low';
     const away = this.drifted >= lost * (this.root.dataset.drifted === 'true' ? 0.85 : 1);
+    const beyond = this.value + this.drifted >= trusted * (this.root.dataset.beyond === 'true' ? 0.9 : 1);
     const share = Math.min(1, this.value / (1.6 * high)).toFixed(3), percent = (part) => `${(100 * part).toFixed(1)}%`;
     if (`${share} ${percent(this.drifted)}` === this.shown) return;
     this.shown = `${share} ${percent(this.drifted)}`;
     this.fill.style.transform = `scaleX(${share})`;
     this.root.dataset.level = this.level;
     this.root.dataset.drifted = away;
+    this.root.dataset.beyond = beyond;
     this.root.ariaValueMax = 1.6 * high;
     this.root.ariaValueNow = this.value;
     this.root.title = `${WORDS[this.level]}. Expected error of the picture: ${percent(this.value)} of full brightness by invention, `
-      + `${percent(this.drifted)} by a position that has drifted`;
+      + `${percent(this.drifted)} by a position that has drifted. `
+      + (beyond ? 'Beyond trust: a quarter of the way to a random picture' : 'Within trust');
   }
 }

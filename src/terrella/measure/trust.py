@@ -1,0 +1,128 @@
+"""The trust horizon of a world: for how many steps a rollout is nearer to the truth than to chance, forecast and measured.
+
+Trust ends where the mean error is a quarter of the way from that of the first step to that of chance, which is what two random
+observations differ by. The forecast needs no truth: it takes the world's own `uncertainty` in a rollout.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from ..core.policy import Policy, Random, act
+from ..core.spec import chance_error, trust_level
+from ..core.state import State
+from ..core.world import World, make_rng
+from .clips import Clip, evidence
+from .exam import CLIPS, LONG, Exam, ExamResults, Probe
+from .rollouts import Results, StepMetric, rows_at
+from .scorecard import PREDICTED, ProbeReport, Row
+from .statistics import Figure
+
+ROLLOUTS, HOLD = 8, (3, 40)  # of a forecast; steps for which its random actions are held
+LEAD = (
+    "Trust ends where the mean error is a quarter of the way from that of the first step to that of chance: what two random "
+    "observations differ by. Forecast: by the error that the world itself expects. Measured: by the error that it has."
+)
+
+
+@dataclass(frozen=True)
+class TrustForecast:
+    """For how long rollouts of a world can be trusted, without a look at the truth."""
+
+    steps: int  # that are within trust; `limit` where the rollouts end before trust does
+    limit: int  # steps of the rollouts
+    level: float  # expected error at which trust ends, in the unit of `uncertainty`
+    expected: tuple[float, ...]  # mean expected error of each step
+
+    @property
+    def ends(self) -> bool:
+        """Whether trust ends within the rollouts."""
+        return self.steps < self.limit
+
+
+def steps_within(errors: torch.Tensor, level: float) -> int:
+    """The steps before the errors [T] reach the level for good, by the split into lower and higher ones that fits best: of errors
+    that only grow, those below the level."""
+    left = (level - errors.double()).cumsum(0)
+    return int(torch.cat([left.new_zeros(1), left]).argmax())
+
+
+@torch.inference_mode()
+def forecast_trust(
+    world: World, limit: int, state: State | None = None, policy: Policy | None = None, seed: int = 0
+) -> TrustForecast | None:
+    """How many steps from `state` (default: 8 starts of the world) can be trusted, of at most `limit`, under a policy (default:
+    held random actions) that is shown nothing. None for a world that expects no error."""
+    chance, rng = chance_error(world.spec), make_rng(seed)
+    if not math.isfinite(chance) or limit < 1:
+        return None
+    state = world.start(min(ROLLOUTS, world.spec.max_batch or ROLLOUTS), rng) if state is None else state
+    policy = Random(world.spec, HOLD) if policy is None else policy
+    memory, expected = policy.begin(state.batch, rng), []
+    for _ in range(limit):
+        action, memory = act(policy, {}, memory, state.batch, world.spec, rng)
+        state = world.imagine(state, action, rng)
+        expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float().mean()))
+    level = trust_level(expected[0], chance)
+    return TrustForecast(steps_within(torch.tensor(expected), level), limit, level, tuple(expected))
+
+
+# -- the probe: forecast beside measured ----------------------------------------------------------------------------
+
+
+def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
+    if of not in (CLIPS, LONG) or _missing(exam, world):
+        return []
+    if "latent" not in world.spec.channels:
+        return [StepMetric(("rgb", "uncertainty"), _picture_error)]
+
+    def latents(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
+        truth = world.render(world.observe(evidence(clips, world.spec, row), None, make_rng(0)), ("latent",))["latent"]
+        return {"latent": seen["latent"], "true latent": truth.cpu(), "expected": seen["uncertainty"]}
+
+    return [StepMetric(("latent", "uncertainty"), latents)]
+
+
+def _picture_error(seen, clips: Sequence[Clip], row: int, step: int) -> Results:
+    error = (seen["rgb"].float() - rows_at(clips, "rgb", row).float()).abs().mean((1, 2, 3)) / 255
+    return {"off": error, "expected": seen["uncertainty"]}
+
+
+def errors_of(dreamt: Results) -> torch.Tensor:
+    """The error [n, T] of the rollouts, in the unit of `uncertainty`."""
+    if "off" in dreamt:
+        return dreamt["off"]
+    truth = dreamt["true latent"]
+    unit = truth.flatten(0, 1).std(0, correction=0).clamp_min(1e-6)
+    return ((dreamt["latent"] - truth) / unit).square().mean(-1).sqrt()
+
+
+def _report(exam: Exam, results: ExamResults) -> ProbeReport:
+    """Of the longest rollouts of each place."""
+    report = ProbeReport()
+    for place in exam.places:
+        for arm, world in exam.arms.items():
+            dreamt = results.dreamt(LONG, arm, place, PREDICTED) or results.dreamt(CLIPS, arm, place, PREDICTED)
+            if "expected" not in dreamt:
+                continue
+            expected, error = dreamt["expected"].float().mean(0), errors_of(dreamt).float().mean(0)
+            level, limit = trust_level(float(expected[0]), chance_error(world.spec)), len(error)
+            for what, curve in (("forecast", expected), ("measured", error)):
+                steps = steps_within(curve, level)
+                note = f"mean error of {level:.3g}" + ("; not reached in these rollouts" if steps == limit else "")
+                figure = Figure(float(steps), math.nan, math.nan, len(dreamt["expected"]))
+                report.rows.append(
+                    Row("trust", "", f"trust horizon, {what}", "steps", place, arm, PREDICTED, limit, figure, note=note)
+                )
+    return report
+
+
+def _missing(exam: Exam, world: World) -> str:
+    if not math.isfinite(chance_error(world.spec)):
+        return "needs uncertainty, a channel of the world, and what two random observations differ by"
+    return "" if "latent" in world.spec.channels or "rgb" in exam.shared(world, "rgb") else "needs rgb"
+
+
+TRUST = Probe("trust", "For how long can it be trusted?", LEAD, _missing, _report, _watch)

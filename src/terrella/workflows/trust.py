@@ -1,0 +1,40 @@
+"""Planners and practice stop where a world's trust horizon ends, and say so."""
+
+from dataclasses import replace
+
+from ..act.planning import SearchConfig
+from ..core.world import World
+from ..learn.recipes.policy import Practice, settings_in
+from ..measure.trust import forecast_trust
+from .progress import Progress
+
+
+def search_within_trust(world: World, search: SearchConfig, progress: Progress) -> SearchConfig:
+    """The search, with a horizon of at most as many moves as the world can be trusted for; as it is where `trust` is set, and in a
+    world that expects no error. search: without zeros."""
+    if search.trust is not None:
+        return search
+    moves = _trusted(world, search.horizon * search.block, "plans", progress) // search.block
+    horizon = max(1, min(search.horizon, moves))
+    return replace(search, horizon=horizon, replan=min(search.replan, horizon))
+
+
+def practice_within_trust(world: World, practice: Practice, progress: Progress) -> Practice:
+    """The same of the rollouts of practice."""
+    settings, _ = settings_in(world, practice)
+    if practice.trust is not None:
+        return practice
+    steps = max(1, _trusted(world, settings.horizon, "rollouts", progress))
+    return replace(practice, horizon=steps) if steps < settings.horizon else practice
+
+
+def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
+    """At most `steps`: the steps for which the world can be trusted. Says where that is fewer."""
+    forecast = forecast_trust(world, steps)
+    if forecast is None or not forecast.ends:
+        return steps
+    progress(
+        f"{world.spec.name} is not trusted beyond {forecast.steps} of {steps} steps: there it expects an error of "
+        f"{forecast.level:.2g}, a quarter of the way to chance. Its {what} end there; --trust sets another limit."
+    )
+    return forecast.steps

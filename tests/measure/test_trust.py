@@ -1,0 +1,108 @@
+"""The trust horizon: forecast from a world's own uncertainty, measured by the truth, and where planners and practice stop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from terrella.act.planning import SearchConfig
+from terrella.core import Spec, State, make_rng
+from terrella.core.spec import chance_error, trust_level
+from terrella.learn.recipes.policy import Practice
+from terrella.measure.clips import Clip
+from terrella.measure.exam import CLIPS, Exam, ExamConfig
+from terrella.measure.examine import examine
+from terrella.measure.trust import TRUST, forecast_trust, steps_within
+from terrella.workflows.trust import practice_within_trust, search_within_trust
+
+CARD = {"uncertainty": {"ceiling": 0.4}}
+
+
+class Fading:
+    """Grey pictures that become brighter by `off` a step, where the truth stays black; it expects an error of `expects` a step."""
+
+    def __init__(self, off: float = 0.01, expects: float = 0.01, card: dict = CARD):
+        self.off, self.expects = off, expects
+        unit = spaces.Box(0, 1, (), np.float32)
+        shows = {"rgb": spaces.Box(0, 255, (4, 4, 3), np.uint8), "uncertainty": unit, "reward": unit}
+        self.spec = Spec("fading", spaces.Discrete(2), shows, ("rgb",), 0.1, card=card, idle=(0,))
+
+    def start(self, batch, rng):
+        return State({"step": torch.zeros(batch)})
+
+    def observe(self, observation, prior, rng):
+        return self.start(len(observation["rgb"]), rng)
+
+    def imagine(self, state, action, rng):
+        return state.replace(step=state["step"] + 1)
+
+    def render(self, state, channels):
+        grey = (255 * self.off * state["step"]).round().to(torch.uint8).view(-1, 1, 1, 1).expand(-1, 4, 4, 3)
+        every = {"rgb": grey, "uncertainty": self.expects * state["step"], "reward": torch.zeros(state.batch)}
+        return {name: every[name] for name in channels}
+
+
+def test_the_level_is_a_quarter_of_the_way_to_chance():
+    assert trust_level(0.1, 0.5) == pytest.approx(0.2)
+    assert trust_level(0.6, 0.5) == 0.6, "a first step worse than chance is not trusted"
+    assert chance_error(Fading().spec) == 0.4
+    assert math.isnan(chance_error(Fading(card={}).spec)) and math.isnan(
+        chance_error(Fading(card={"uncertainty": 3}).spec)
+    )
+    spec = Fading().spec
+    latent = replace(spec, card={}, channels={**spec.channels, "latent": spaces.Box(-1, 1, (2,))})
+    assert chance_error(latent) == math.sqrt(2)
+    assert steps_within(torch.tensor([0.1, 0.2, 0.3, 0.4]), 0.25) == 2 and steps_within(torch.zeros(3), 0.25) == 3
+    assert steps_within(torch.tensor([0.1, 0.3, 0.1, 0.1, 0.4, 0.2, 0.4]), 0.25) == 4, (
+        "one step that is worse by chance"
+    )
+
+
+def test_the_forecast_is_where_the_expected_error_reaches_the_level():
+    found = forecast_trust(Fading(), 50)
+    assert found is not None and found.level == pytest.approx(0.01 + 0.39 / 4) and found.steps == 10 and found.ends
+    short = forecast_trust(Fading(), 5)
+    assert short is not None and (short.steps, short.ends) == (5, False)
+    other = forecast_trust(Fading(), 50, Fading().start(3, make_rng(0)))
+    assert other is not None and other.steps == 10
+    assert forecast_trust(Fading(card={}), 50) is None, "it cannot say how far off chance is"
+
+
+def test_planners_and_practice_stop_there_and_say_so():
+    said: list[str] = []
+    search = SearchConfig(replan=20).filled(horizon=20)
+    cut = search_within_trust(Fading(), search, said.append)
+    assert (cut.horizon, cut.replan) == (10, 10) and "not trusted beyond 10 of 20 steps" in said[0]
+    assert search_within_trust(Fading(), SearchConfig(block=4).filled(), said.append).horizon == 2
+    practice = practice_within_trust(Fading(), Practice(), said.append)
+    assert practice.horizon == 10 and "rollouts end there" in said[-1]
+    count = len(said)
+    assert search_within_trust(Fading(), replace(search, trust=0.3), said.append).horizon == 20, "somebody set a limit"
+    assert practice_within_trust(Fading(), Practice(trust=0.3), said.append).horizon is None
+    assert practice_within_trust(Fading(), Practice(horizon=5), said.append).horizon == 5
+    assert search_within_trust(Fading(card={}), search, said.append) == search, "a world that cannot say"
+    assert len(said) == count
+
+
+def black(steps: int) -> Clip:
+    return Clip({"rgb": np.zeros((steps, 4, 4, 3), np.uint8)}, np.zeros(steps, np.int64), 2, 0, 0)
+
+
+@pytest.mark.parametrize("off, steps", [(0.01, 10), (0.02, 5), (0.001, 30)])
+def test_the_scorecard_has_the_forecast_beside_the_measured_horizon(off, steps):
+    config = ExamConfig(horizons=(30,), control_horizons=(), long_steps=0, still_steps=0, speed_steps=0)
+    card = examine(Exam({"a": Fading(off)}, {CLIPS: {"recorded": [black(32)] * 2}}, config), probes=(TRUST,))
+    (forecast,), (measured,) = (card.find("trust", f"trust horizon, {what}") for what in ("forecast", "measured"))
+    assert (forecast.figure.value, measured.figure.value) == (10, steps)
+    assert ("not reached" in measured.note) == (steps == 30)
+
+
+def test_a_world_that_expects_no_error_is_named_with_what_it_lacks():
+    config = ExamConfig(horizons=(30,), control_horizons=(), long_steps=0, still_steps=0, speed_steps=0)
+    card = examine(Exam({"a": Fading(card={})}, {CLIPS: {"recorded": [black(32)] * 2}}, config), probes=(TRUST,))
+    assert not card.rows and "needs uncertainty" in card.missing[0].why
