@@ -49,7 +49,7 @@ def test_the_report_stands_alone(card, tmp_path):
         "Does it remember?",
         "A long rollout",
         "Does it fade without actions?",
-        "Speed",
+        "What does it cost?",
     ):
         assert f"<h2>{heading}</h2>" in html
     for svg in re.findall(r"<svg .*?</svg>", html):
