@@ -20,6 +20,9 @@ from terrella.learn.recording import Recording, joined_cameras
 from terrella.library import load
 from terrella.measure.overlap import disagreement, overlaps_of
 from terrella.space.camera import rays, relative_pose, rotation
+from terrella.space.overlap import Blend, MountedCamera
+from terrella.worlds.frame_history import split_pictures
+from terrella.worlds.parts import newest_frame
 
 SIZE = (16, 24)
 YAWS = {"rgb": 0.0, "rgb.left": math.radians(70), "rgb.right": -math.radians(70)}
@@ -110,10 +113,12 @@ def test_a_world_of_three_cameras_is_learned_saved_and_plays(recorded, tmp_path)
         3,
     )
     assert world.outcome.config.side == 3 * 64, "its outcome sees each picture as large as that of a single camera"
+    blend = world.generator.blend
+    assert blend.own.shape == (16, 72) and (blend.own < 1).any(), "its drawn pictures are made to agree"
     given = {name: torch.full((1, *SIZE, 3), value, dtype=torch.uint8) for value, name in enumerate(world.cameras)}
     state = world.observe(given, None, make_rng(0))
     shown = world.render(state, ("rgb.right", "rgb"))
-    assert (shown["rgb.right"] == 2).all() and (shown["rgb"] == 1).all() and world.frame(state).shape == (1, 3, 16, 72)
+    assert (shown["rgb.right"] == 2).all() and (shown["rgb"] == 1).all() and newest_frame(state).shape == (1, 3, 16, 72)
     with pytest.raises(ObservationError, match=r"rgb\.left and rgb and rgb\.right"):
         world.observe({"rgb": given["rgb"]}, None, make_rng(0))
     assert len(overlaps_of(world.spec, world.cameras)) == 2, "left and right do not overlap"
@@ -134,6 +139,31 @@ def test_views_of_one_room_agree_where_they_overlap():
         same = disagreement(seen[pair.one], seen[pair.other], pair)
         other = disagreement(seen[pair.one], seen[pair.other].roll(1, 0), pair)
         assert (same < 3).all() and other.mean() > 10 * same.mean()
+
+
+def test_blended_pictures_agree_where_views_overlap_and_stay_elsewhere():
+    mounts = {name: tuple(turned(torch.tensor(yaw)).tolist()) for name, yaw in YAWS.items()}
+    names = ("rgb.left", "rgb", "rgb.right")
+    blend = Blend([MountedCamera(FIELD, mounts[name]) for name in names], SIZE)
+    colours = torch.nn.functional.interpolate(torch.rand(2, 3, 4, 18, generator=make_rng(0)), (16, 72), mode="bicubic")
+    pictures, blended = 255 * colours, blend(255 * colours)
+    assert (
+        torch.equal(blended[..., blend.own == 1], pictures[..., blend.own == 1])
+        and 0.2 < (blend.own < 1).float().mean() < 0.5
+    )
+    spec = Spec("ring", Carousel().spec.action, Carousel().spec.channels, (), 0.1, cameras={
+        name: Camera(FIELD, SIZE, None, mounts[name]) for name in names
+    })  # fmt: skip
+    pairs = overlaps_of(spec, names)
+    before, after = (
+        torch.stack([disagreement(shown[pair.one], shown[pair.other], pair) for pair in pairs])
+        for shown in (split_pictures(each.permute(0, 2, 3, 1), names) for each in (pictures, blended))
+    )
+    assert (after < 0.3 * before).all()
+    noise = torch.randn(64, 3, 16, 72, generator=make_rng(1))
+    shared = blend.noise(noise)
+    assert (shared.std(0) > 0.5).all() and abs(float(shared.std()) - 1) < 0.02
+    assert (shared != noise).any() and torch.isin(shared, noise).all()
 
 
 def test_relative_poses_undo_the_body():

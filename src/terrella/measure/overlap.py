@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from ..core.spec import Camera, Spec
 from ..core.world import Observation, World
-from ..space.camera import project, unproject
+from ..space.overlap import MountedCamera, seen_by
 from .clips import Clip
 from .exam import CLIPS, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric, rows_at
@@ -22,7 +22,6 @@ LEAD = (
     "over that in the recording, which is not 0, for cameras stand apart and pixels are coarse. 1 is as consistent as the truth. "
     "Blurred pictures agree easily: look at sharpness beside it. The baseline compares each picture with that of another clip."
 )
-FAR_M = 1000.0  # what is seen is taken to be so far away
 FEWEST = 32  # pixels of an overlap
 
 
@@ -45,11 +44,9 @@ def overlaps_of(spec: Spec, names: Sequence[str]) -> list[Overlap]:
 
 
 def _overlap(one: str, other: str, camera: Camera, beside: Camera) -> Overlap:
-    mounts = torch.tensor([camera.mount, beside.mount])
-    points = unproject(torch.full(camera.size, FAR_M), mounts[0], camera.intrinsics)
-    at, depth = project(points.flatten(0, 1), mounts[1], beside.intrinsics)
-    seen = (depth > 0) & (at > 0).all(1) & (at < 1).all(1)
-    return Overlap(one, other, (2 * at - 1).view(1, *camera.size, 2), seen.view(camera.size))
+    first, second = (MountedCamera(each.intrinsics, each.mount) for each in (camera, beside))
+    at, seen = seen_by(second, first, camera.size)
+    return Overlap(one, other, 2 * at[None] - 1, seen)
 
 
 def disagreement(one: torch.Tensor, other: torch.Tensor, overlap: Overlap) -> torch.Tensor:

@@ -4,7 +4,7 @@ A U-Net in two halves. The first sees the last frames and the actions, once a fr
 sees its features, the noisy frame x_t and what memory knows of the picture. The network predicts the clean frame x_1 from
 x_t = (1 - t) noise + t x_1 (x-prediction). Its first step, t = 0, needs no noise: the draft is the mean of all that may follow.
 Where pictures scroll, it draws the change of the last frame carried along (global motion compensation), and a mosaic remembers
-what left the picture.
+what left the picture. Where several cameras overlap, their pictures are made to agree.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..space.mosaic import read_mosaic
+from ..space.overlap import Blend, MountedCamera
 from .generator import Conditioning, encode_depth, parts_of
 from .scroll import Scroll, predicted_scroll
 
@@ -40,6 +41,7 @@ class FlowConfig:
     moves: int = 0  # displacements by which pictures scroll, beside (0, 0); 0: no memory either
     channels: tuple[int, ...] = (64, 112, 160)  # at 1/4, 1/8 and 1/16 of the size
     steps: int = 3  # drawing steps a frame, the draft included
+    views: tuple[MountedCamera, ...] = ()  # cameras whose pictures lie side by side in a frame, from the left; (): one
 
 
 class FlowFeatures(NamedTuple):
@@ -81,6 +83,8 @@ class FlowNetwork(nn.Module):
         self.register_buffer("moves", torch.zeros(config.moves + 1, 2, dtype=torch.int64))
         self.register_buffer("over", torch.zeros(config.size, dtype=torch.bool))
         self.scrolling = Scroll(config.size, config.slots, config.context, config.moves) if config.moves else None
+        views, (height, width) = [MountedCamera(*view) for view in config.views], config.size
+        self.blend = Blend(views, (height, width // len(views))) if len(views) > 1 else None
         self.actions = nn.Sequential(nn.Linear(config.context, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE), nn.SiLU())
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE))
         self.enter = nn.Conv2d(3 * config.slots, fine, SQUARE, stride=SQUARE)
@@ -151,10 +155,12 @@ class FlowNetwork(nn.Module):
         """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. The rest: as in `encode`."""
         seen = self.encode(frames, context, scroll, memory)
         time = torch.zeros(len(noise), device=noise.device)
-        x = self.clean(seen, seen.base, time, memory)
+        agreed = self.blend or (lambda x: x)  # after each step, as in MultiDiffusion (Bar-Tal et al. 2023)
+        noise = noise if self.blend is None else self.blend.noise(noise)
+        x = agreed(self.clean(seen, seen.base, time, memory))
         for step in range(1, steps):
             t = step / steps
-            x = self.clean(seen, (1 - t) * noise + t * x.clamp(-1, 1), time + t, memory)
+            x = agreed(self.clean(seen, (1 - t) * noise + t * x.clamp(-1, 1), time + t, memory))
         x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
         if memory is not None:
             known = memory[:, :3].float() / 127.5 - 1

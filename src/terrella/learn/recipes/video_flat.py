@@ -10,6 +10,7 @@ from ...core.errors import DatasetError, TrainingError
 from ...space.ground import joined
 from ...space.matching import scroll_index
 from ...space.mosaic import read_mosaic
+from ...space.overlap import MountedCamera
 from ...worlds.config import VideoConfig
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowConfig, FlowNetwork, carry
@@ -56,7 +57,10 @@ class FlowRecipe:
         scrolling, plain = _scrolling_of(self.parts), self.video.generator
         moves, self.over = scrolling.moves, scrolling.over
         steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
-        network = FlowNetwork(FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths, steps))
+        views = tuple(MountedCamera(lens.intrinsics, lens.mount) for lens in recording.lenses().values())
+        settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths, steps)
+        mounted = len(views) == len(recording.cameras)  # it is known of each how it is mounted
+        network = FlowNetwork(replace(settings, views=views) if mounted else settings)
         network.moves[:], network.over[:] = moves, self.over
         lengths = np.array([np.diff(recording.cache.episodes[number])[0] for number in recording.seen] or [0])
         rollout, stress = (
