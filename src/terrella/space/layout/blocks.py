@@ -10,6 +10,7 @@ from ...core.errors import ContractError
 from .furniture import kind_of
 from .looks import Look, look_of
 from .room_layout import REACH_M, WALL_M, WALLS, Door, Room, RoomLayout, Stairs, Thing, Window, room_at
+from .shapes import SHARP, Shape
 
 RISER_M = 0.18  # largest height of a step
 FRAME_M = 0.05
@@ -30,16 +31,26 @@ class Blocks:
     looks: list[Look] = field(default_factory=list)
     objects: list[int] = field(default_factory=list)  # the object that each belongs to, 0 for the building
     solid: list[bool] = field(default_factory=list)  # whether each stops walkers
+    shapes: list[Shape] = field(default_factory=list)
     air: list[tuple[Corner, Corner]] = field(default_factory=list)  # boxes of free space
     names: list[str] = field(default_factory=list)  # of objects 1, 2, ...
     movable: set[int] = field(default_factory=set)  # the objects that can be pushed
 
-    def add(self, low: Sequence[float], high: Sequence[float], look: Look, thing: int = 0, solid: bool = True) -> None:
+    def add(
+        self,
+        low: Sequence[float],
+        high: Sequence[float],
+        look: Look,
+        thing: int = 0,
+        solid: bool = True,
+        shape: Shape = SHARP,
+    ) -> None:
         self.low.append((low[0], low[1], low[2]))
         self.high.append((high[0], high[1], high[2]))
         self.looks.append(look)
         self.objects.append(thing)
         self.solid.append(solid)
+        self.shapes.append(shape)
 
     def named(self, name: str) -> int:
         """The number of a new object."""

@@ -77,3 +77,15 @@ def _sunlit(gaussians: Gaussians, towards: np.ndarray) -> np.ndarray:
     u, v = (at * _SUN_SIZE).long().clamp(0, _SUN_SIZE - 1).unbind(-1)
     depth, alpha = view.depth[0][v, u], view.alpha[0][v, u]
     return ((alpha < 0.5) | (deep < depth / alpha.clamp_min(0.5) + _SLACK * radius / 3 + _SLACK_M)).numpy()
+
+
+def exposed(own: np.ndarray, falls: np.ndarray, shines: np.ndarray) -> np.ndarray:
+    """Colours [N, 3] as a camera shows them: surfaces of the colours `own` under the light `falls` [N, 3]; light sources, `shines`
+    bool [N], keep their colours."""
+    shown = own**2.2 * falls
+    middle = np.exp(np.log(np.maximum(falls[~shines].mean(1), 1e-4)).mean()) if not shines.all() else 1.0
+    shown = shown * (0.62 / middle)
+    mapped = shown * (1 + shown / 9) / (1 + shown * 0.78)  # Reinhard's curve with a white point
+    pictured = np.clip(mapped, 0, 1) ** (1 / 2.2)
+    pictured[shines] = own[shines]
+    return pictured

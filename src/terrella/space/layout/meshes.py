@@ -4,15 +4,17 @@ import numpy as np
 import torch
 
 from ..camera import rotation
+from ..edits import REVEALED
 from ..files.gltf_scene import GltfScene
 from ..raster import Gaussians
 from ..raster.gaussians import plain_sh
 from ..raster.move import multiply_quaternions
-from .bake import FINEST_M, OPACITY, THIN_M, exposed
-from .mesh_light import falling
+from .cells import THIN_M
+from .mesh_light import exposed, falling
 from .mesh_solids import solids_of
 from .pieces import pieces
 
+FINEST_M = 0.006
 _WIDE = 2.4  # deviations of a Gaussian beside those of the piece that it stands for
 _INNER = (
     np.array([[i + 1 / 3, j + 1 / 3, 4 - i - j - 2 / 3] for i in range(4) for j in range(4 - i)]) / 4
@@ -81,4 +83,4 @@ def _flat(corners: np.ndarray, normals: np.ndarray, opacities: np.ndarray) -> Ga
     scales = torch.cat([wide.clamp_min(THIN_M), torch.full((len(up), 1), THIN_M)], 1)
     quats = multiply_quaternions(lying, torch.stack([half.cos(), zero, zero, half.sin()], 1))
     grey = plain_sh(torch.full((len(up), 3), 0.5))
-    return Gaussians(middle - THIN_M * way, quats, scales, OPACITY * torch.from_numpy(opacities).float(), grey)
+    return Gaussians(middle - THIN_M * way, quats, scales, REVEALED * torch.from_numpy(opacities).float(), grey)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import ContractError
+from .daylight import daylight_of
 from .looks import look_of
 
 WALL_M = 0.1
@@ -100,7 +101,10 @@ class RoomLayout:
     start: tuple[float, float, float] | None = None  # x, y and heading in degrees (0 east, 90 north)
     name: str = ""  # default: the file's
     seed: int = 0
-    sun: tuple[float, float] | None = (215.0, 42.0)  # its heading and its height above the horizon, degrees
+    time: str = "day"  # of the day (daylight.py)
+    sun: tuple[float, float] | None = (
+        None  # its heading and its height above the horizon, degrees; default: by the time
+    )
 
     def __post_init__(self):
         check(self)
@@ -176,6 +180,7 @@ def _value(value: Any, kind: str, where: str) -> Any:
 
 def check(plan: RoomLayout) -> None:
     """ContractError for a layout that cannot be built."""
+    daylight_of(plan.time)
     if not plan.rooms:
         raise ContractError("a layout has at least one room.")
     names = [room.name for room in plan.rooms]

@@ -3,7 +3,8 @@
 import numpy as np
 from PIL import Image
 
-from ..layout.looks import MATERIALS, Look, texture_colours
+from ..layout.looks import MATERIALS
+from ..layout.textures import texture_colours
 
 SIDE = 128  # texels
 MATERIAL_M = 2.0  # what the texture of a material covers
@@ -18,9 +19,9 @@ def atlas_of(seed: int) -> np.ndarray:
     u, v = (part.ravel() for part in np.meshgrid(at, at))
     textures = []
     for name in MATERIALS:
-        white = Look(name, (0.75, 0.75, 0.75))
         for _ in range(VARIANTS):
-            seen = texture_colours(white, u, v, MATERIAL_M / SIDE, int(rng.integers(1 << 20)))
+            size, seed = (MATERIAL_M, MATERIAL_M), int(rng.integers(1 << 20))
+            seen = texture_colours(name, (0.75, 0.75, 0.75), (u, v), size, MATERIAL_M / SIDE, seed)
             textures.append((seen / 0.75).reshape(SIDE, SIDE, 3))
     textures += [_pattern(rng) for _ in range(RANDOM)]
     return (np.clip(np.stack(textures), 0, 1.6) ** 2.2).astype(np.float32)
