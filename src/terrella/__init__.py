@@ -21,10 +21,13 @@ if TYPE_CHECKING:
     from .learn.recipes.policy import Practice
     from .learn.recipes.video import TrainConfig
     from .library import as_sb3, load, load_policy, worlds
+    from .workflows.build_space import BuildSpaceConfig
     from .workflows.check import CheckConfig, CheckResult, check
     from .workflows.collect import CollectConfig, CollectResult, collect
     from .workflows.evaluate import EvaluateConfig, EvaluateResult, evaluate
+    from .workflows.generate_place import generate_place
     from .workflows.learn import LearnConfig, LearnResult, learn
+    from .workflows.lift_space import LiftSpaceConfig
     from .workflows.opening import ControlsConfig, EnvironmentConfig
     from .workflows.plan import plan
     from .workflows.plan_result import PlanResult
@@ -43,10 +46,13 @@ _NAMES = {
     ".learn.recipes.policy": ("Practice",),
     ".learn.recipes.video": ("TrainConfig",),
     ".library": ("as_sb3", "load", "load_policy", "worlds"),
+    ".workflows.build_space": ("BuildSpaceConfig",),
     ".workflows.check": ("CheckConfig", "CheckResult", "check"),
     ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
     ".workflows.evaluate": ("EvaluateConfig", "EvaluateResult", "evaluate"),
+    ".workflows.generate_place": ("generate_place",),
     ".workflows.learn": ("LearnConfig", "LearnResult"),
+    ".workflows.lift_space": ("LiftSpaceConfig",),
     ".workflows.opening": ("ControlsConfig", "EnvironmentConfig"),
     ".workflows.plan": ("plan",),
     ".workflows.plan_result": ("PlanResult",),

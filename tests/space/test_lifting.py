@@ -13,14 +13,14 @@ from PIL import Image
 
 import terrella
 from terrella.cli import main
-from terrella.core.errors import CheckpointError
+from terrella.core.errors import CheckpointError, TerrellaError
 from terrella.learn.objectives.lifting import LayeredPictures, LiftingObjective
 from terrella.learn.trainer import TrainStep
 from terrella.space.camera import rotation
 from terrella.space.kernels_numba import shapes as kernels
 from terrella.space.kernels_numba.light import first_box
 from terrella.space.lifting import layers as layers_module
-from terrella.space.lifting.layers import PictureLayers, floor_height, layers_of, to_gaussians
+from terrella.space.lifting.layers import PictureLayers, floor_height, layers_of, levelled, to_gaussians
 from terrella.space.lifting.network import Lifter, LifterConfig, load_lifter, save_lifter
 from terrella.space.lifting.scenes import rotation_of
 from terrella.space.raster import rasterise
@@ -127,6 +127,14 @@ def test_the_frame_is_metric_with_the_floor_at_zero():
     assert floor_height(replace(layers, depth=torch.full((48, 64), 3.0), pitch=0.0)) is None  # a wall has no floor
 
 
+def test_a_wrong_tilt_is_corrected_by_the_floor():
+    layers = a_box_before_a_wall()
+    level = levelled(replace(layers, pitch=-0.14, roll=0.05, height_m=1.0))
+    assert level.pitch == pytest.approx(-0.2, abs=0.01) and level.roll == pytest.approx(0, abs=0.01)
+    assert level.height_m == pytest.approx(1.5, rel=0.03)
+    assert levelled(replace(layers, pitch=0.3)).pitch == 0.3  # too far off to be this floor
+
+
 def test_quaternions_are_those_of_their_frames():
     frames = torch.linalg.qr(torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(0)))[0]
     frames = frames * frames.det()[:, None, None]
@@ -134,8 +142,10 @@ def test_quaternions_are_those_of_their_frames():
     assert torch.allclose(rotation(torch.cat([torch.zeros(50, 3), quats], 1)), frames, atol=1e-5)
 
 
-def test_bodies_stop_at_the_box_of_a_picture():
+def test_bodies_stop_at_the_box_of_a_picture_and_stand_on_its_floor():
     world = place_of(a_box_before_a_wall(), "box", {})
+    places = world.places[world.places[:, 3] > 0]
+    assert len(places) > 8 and float(places[:, 0].max()) > 0.7  # from below the camera, where the floor is invented
     state = world.start(1, terrella.make_rng(0))
     ahead = torch.zeros(1, 8, dtype=torch.int8)
     ahead[0, 0] = 1
@@ -233,6 +243,20 @@ def test_a_picture_becomes_a_place_that_opens(tmp_path, capsys):
     )
     seen = world.render(world.start(1, terrella.make_rng(0)), ("rgb", "depth"))
     assert seen["rgb"].shape == (1, 172, 256, 3) and float((seen["depth"] > 0).float().mean()) > 0.9
+
+
+def test_one_function_makes_places_of_all_sources(tmp_path):
+    picture = picture_file(tmp_path / "a.png")
+    facts = terrella.generate_place(
+        tmp_path / "p", image=picture, config=terrella.LiftSpaceConfig(longest=64, eye=2.0)
+    ).facts
+    assert facts["height_m"] == 2.0 and float(terrella.load(tmp_path / "p").starts[0, 2]) == 2.0
+    small = terrella.BuildSpaceConfig(gaussians=1000, size=(24, 32))
+    assert terrella.generate_place(tmp_path / "t", text="a tiny room", config=small).facts["rooms"] == 1
+    with pytest.raises(TerrellaError, match="give one of"):
+        terrella.generate_place(tmp_path / "x", text="a room", image=picture)
+    with pytest.raises(TerrellaError, match="LiftSpaceConfig"):
+        terrella.generate_place(tmp_path / "x", image=picture, config=small)
 
 
 def test_photographs_of_all_kinds(tmp_path, capsys):

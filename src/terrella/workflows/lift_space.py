@@ -8,10 +8,11 @@ import torch
 from PIL import Image, UnidentifiedImageError
 
 from ..core.errors import DatasetError, TerrellaError
-from ..space.lifting.layers import HIDES, PictureLayers, layers_of, to_gaussians
+from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of, to_gaussians
 from ..space.lifting.network import load_lifter
 from ..space.occupancy import Walker
 from ..space.pictures.reading import read_picture
+from ..space.raster import join
 from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import check_free, save_splat
@@ -59,6 +60,8 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
 def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
     """The place of a picture's layers, with a walker whose eyes are where its camera was."""
     gaussians, seen = to_gaussians(layers)
+    floor = floor_below(gaussians.at(seen))
+    gaussians, seen = join([gaussians, floor]), torch.cat([seen, torch.zeros(len(floor), dtype=torch.bool)])
     height, width = layers.depth.shape
     share = 256 / max(height, width)
     size = (max(round(height * share), 8), max(round(width * share), 8))

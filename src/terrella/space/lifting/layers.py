@@ -18,9 +18,15 @@ from .scenes import rotation_of
 SIGMA = 0.62  # standard deviation of a Gaussian as a share of its pixel's width
 OPACITY, THIN = 0.97, 0.15
 STEEPEST = 5.0  # a pixel's Gaussian is at most this much longer than wide
+WINDOW, ALIKE = (
+    13,
+    0.15,
+)  # pixels of the network's picture, and a difference of logarithms, over which depth is smoothed
 EDGE = 0.06  # steps of the logarithm of depth that are edges
 HIDES = 0.35  # the probability from which a hidden surface is made
 MIRROR = torch.tensor([1.0, 1.0, -1.0, 1.0])  # the view in a mirror: roll turns the other way
+FLOOR_M, CELL_M = 0.08, 0.06  # how far from 0 the floor may lie; the spacing of Gaussians that continue it
+MOST_TILT = 0.15  # radians
 FEWEST_FLOOR = 0.01  # share of pixels that make a floor
 
 
@@ -72,7 +78,7 @@ def layers_of(
     codes = _codes(lifter, seen)
     log_focal, pitch, roll, log_height = (float(part) for part in codes.lens[0])
     focal = focal or math.exp(min(max(log_focal, math.log(0.35)), math.log(1.6)))
-    near = _sharpened(codes.near[0], seen[0], rgb)
+    near = _sharpened(_smoothed(codes.near[0], codes.spread[0]), seen[0], rgb)
     spread = F.interpolate(codes.spread[None], (height, width), mode="bilinear")[0, 0]
     half = (-(-height // 2), -(-width // 2))
     step, hides, behind_rgb = (
@@ -82,7 +88,7 @@ def layers_of(
     depth = near.exp() * focal
     given = (rgb, depth, depth[::2, ::2] * step[0].exp(), hides[0], behind_rgb, spread.exp())
     layers = PictureLayers(*given, focal, pitch, roll, math.exp(log_height))
-    layers = replace(layers, height_m=floor_height(layers) or layers.height_m)
+    layers = levelled(layers)
     if height_m is None:
         return layers
     scale = height_m / layers.height_m
@@ -131,23 +137,68 @@ def _sharpened(near: torch.Tensor, small: torch.Tensor, rgb: torch.Tensor) -> to
     return plain
 
 
+def _smoothed(near: torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
+    """Logarithms of depth [h, w] without ripples: at each pixel a plane through its neighbourhood (inverse depth is linear on
+    planes), weighted by how sure and how alike their depths are."""
+    reach, (height, width) = WINDOW // 2, near.shape
+    inverse, sure = (-near).exp(), (-2 * spread.clamp_min(-4)).exp()
+    padded = [F.pad(part[None, None], (reach,) * 4, mode="replicate") for part in (inverse, near, sure)]
+    value, log, sure = (F.unfold(part, WINDOW)[0] for part in padded)
+    offset = torch.arange(WINDOW) - reach
+    v, u = (part.reshape(-1, 1).float() for part in torch.meshgrid(offset, offset, indexing="ij"))
+    spot = near.flatten()
+    plane = inverse.flatten()
+    for _ in range(2):
+        weight = sure * (-((log - spot) / ALIKE).square() - (u.square() + v.square()) / (2 * (reach / 1.5) ** 2)).exp()
+        basis = torch.stack([torch.ones_like(u), u, v]).expand(3, -1, 1)
+        moments = torch.einsum("ikn,jkn,kp->pij", basis, basis, weight)
+        sums = torch.einsum("ikn,kp->pi", basis, weight * value)
+        ridge = moments[:, :1, :1] * 1e-3 * torch.diag(torch.tensor([0.0, 1.0, 1.0]))
+        plane = torch.linalg.solve(moments + ridge, sums)[:, 0].clamp_min(0.2 * inverse.min())
+        spot = -plane.log()
+    return -plane.log().view(height, width)
+
+
 def floor_height(layers: PictureLayers) -> float | None:
     """The height of the camera above the lowest level surface that fills enough of the picture, if there is one: metres."""
-    points = _points(layers.depth, layers) @ layers.turn.T
-    normal = torch.cross(points.diff(dim=1)[:-1], points.diff(dim=0)[:, :-1], dim=-1)
-    level = normal[..., 2].abs() > 0.94 * normal.norm(dim=-1)
-    down = -points[:-1, :-1, 2]
-    deep = down[level & (down > 0.15)]
-    if len(deep) < FEWEST_FLOOR * down.numel():
+    level, count = _level_points(layers), layers.depth.numel()
+    deep = -level[level[:, 2] < -0.15, 2]
+    if len(deep) < FEWEST_FLOOR * count:
         return None
-    counts = torch.histc(deep.log(), 60, math.log(0.15), math.log(6.0))
-    counts = F.avg_pool1d(F.pad(counts[None], (1, 1)), 3, 1)[0]
-    enough = (counts > max(0.35 * float(counts.max()), 0.3 * FEWEST_FLOOR * down.numel())).nonzero()[:, 0]
+    low, high = math.log(0.15), math.log(6.0)
+    counts = F.avg_pool1d(F.pad(torch.histc(deep.log(), 60, low, high)[None], (1, 1)), 3, 1)[0]
+    enough = (counts > max(0.35 * float(counts.max()), 0.3 * FEWEST_FLOOR * count)).nonzero()[:, 0]
     if not len(enough):
         return None
-    edges = torch.linspace(math.log(0.15), math.log(6.0), 61).exp()
-    low, high = float(edges[max(int(enough[-1]) - 1, 0)]), float(edges[min(int(enough[-1]) + 2, 60)])
-    return float(deep[(deep >= low) & (deep <= high)].median())
+    edges = torch.linspace(low, high, 61).exp()
+    within = (deep >= edges[max(int(enough[-1]) - 1, 0)]) & (deep <= edges[min(int(enough[-1]) + 2, 60)])
+    return float(deep[within].median())
+
+
+def levelled(layers: PictureLayers) -> PictureLayers:
+    """The layers with pitch, roll and height by which their floor is level and lies at 0, where they show one; the camera's tilt is
+    corrected by MOST_TILT at most."""
+    now = layers
+    for band in (0.12, 0.08, 0.05):
+        height = floor_height(now)
+        if height is None:
+            return layers
+        level = _level_points(now)
+        near = level[(level[:, 2] + height).abs() < band * height]
+        flat = torch.cat([near[:, :2], torch.ones(len(near), 1)], 1)
+        a, b, _ = torch.linalg.lstsq(flat, near[:, 2:]).solution[:, 0].tolist()
+        x, y, z = (F.normalize(torch.tensor([-a, -b, 1.0]), dim=0) @ now.turn).tolist()  # what is up, for the camera
+        now = replace(now, pitch=math.asin(x), roll=math.atan2(y, z))
+        if max(abs(now.pitch - layers.pitch), abs(now.roll - layers.roll)) > MOST_TILT:
+            return replace(layers, height_m=floor_height(layers) or layers.height_m)
+    return replace(now, height_m=floor_height(now) or now.height_m)
+
+
+def _level_points(layers: PictureLayers) -> torch.Tensor:
+    """Points [N, 3] of level surfaces, from the camera, along the world's axes."""
+    points = _points(layers.depth, layers) @ layers.turn.T
+    normal = torch.cross(points.diff(dim=1)[:-1], points.diff(dim=0)[:, :-1], dim=-1)
+    return points[:-1, :-1][normal[..., 2].abs() > 0.94 * normal.norm(dim=-1)]
 
 
 def _points(depth: torch.Tensor, layers: PictureLayers) -> torch.Tensor:
@@ -163,6 +214,28 @@ def to_gaussians(layers: PictureLayers, two: bool = True) -> tuple[Gaussians, to
         return first, torch.ones(len(first), dtype=torch.bool)
     more = _of_pixels(layers.behind, layers.behind_rgb, layers.hides > HIDES, layers)
     return join([first, more]), torch.arange(len(first) + len(more)) < len(first)
+
+
+def floor_below(seen: Gaussians) -> Gaussians:
+    """Invented Gaussians of the floor from below the camera, which stands at x = y = 0, to where the picture shows it, in the
+    colours of the nearest part that it shows; none where it shows no floor."""
+    near = seen.means[:, 2].abs() < FLOOR_M
+    floor = seen.at(near.nonzero()[:: max(int(near.sum()) // 4000, 1), 0])
+    if int(near.sum()) < FEWEST_FLOOR * len(seen):
+        return seen.at(torch.zeros(0, dtype=torch.long))
+    first = float(floor.means[:, 0].quantile(0.02))
+    x, y = torch.meshgrid(
+        torch.arange(-1.0, min(first, 6.0) + 0.2, CELL_M), torch.arange(-1.2, 1.2, CELL_M), indexing="ij"
+    )
+    spots = torch.stack([x.flatten(), y.flatten()], 1)
+    apart, nearest = torch.cdist(spots, floor.means[:, :2]).min(1)
+    spots, nearest = spots[apart > CELL_M], nearest[apart > CELL_M]
+    level = torch.full((len(spots), 1), float(floor.means[:, 2].median()))
+    count, flat = len(spots), torch.tensor([0.6 * CELL_M, 0.6 * CELL_M, 0.005])
+    turn = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
+    return Gaussians(
+        torch.cat([spots, level], 1), turn, flat.expand(count, 3), torch.full((count,), OPACITY), floor.sh[nearest]
+    )
 
 
 def _of_pixels(depth: torch.Tensor, rgb: torch.Tensor, some: torch.Tensor, layers: PictureLayers) -> Gaussians:
