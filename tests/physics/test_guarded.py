@@ -69,6 +69,23 @@ def test_a_guard_removes_most_violations_and_most_of_the_error(family):
     assert not report.frozen and report.simulated == 0
 
 
+def test_each_law_is_judged_once_for_each_motion(monkeypatch):
+    """What nothing corrects is judged once a step, however often it is asked."""
+    system, _, known = truth("collision", 1, 120)
+    _, seen, _ = truth("collision", 2, 10)
+    tolerances, counts = calibrate(known), {}
+    for one in tolerances:
+        kind = type(one.law)
+
+        def counted(law, motion, inner=kind.residual):
+            counts[law.name] = counts.get(law.name, 0) + 1
+            return inner(law, motion)
+
+        monkeypatch.setattr(kind, "residual", counted)
+    predicted(Guarded(BodiesWorld("collision", BodiesConfig(pictures=False)), system, tolerances), seen, 10, system)
+    assert counts == {one.law.name: STEPS + 1 for one in tolerances}, "in the first step twice: it has one step only"
+
+
 def test_the_truth_is_left_as_it_is():
     system, _, known = truth("collision", 1, 120)
     _, seen, true = truth("collision", 2, 10)

@@ -40,14 +40,21 @@ def body_gaps(position: Tensor, rotation: Tensor, half: Tensor, radius: Tensor) 
 def wall_gaps(position: Tensor, rotation: Tensor, half: Tensor, radius: Tensor, walls: Sequence[Wall]) -> Tensor:
     """Distances [T, B, N, W] of bodies to walls."""
     gaps = position.new_full((*position.shape[:3], len(walls)), torch.inf)
-    turn, reach = rotated(rotation), half.norm(dim=-1)
+    reach = half.norm(dim=-1)
+    boxes = bool((reach > 0).any())  # spheres have no turn
+    turn = rotated(rotation) if boxes else rotation.new_zeros(()).expand(*rotation.shape[:-1], 3, 3)
+    planes = [at for at, wall in enumerate(walls) if wall.normal is not None]
+    if planes:
+        normals = position.new_tensor([walls[at].normal for at in planes])
+        heights = (normals * position.new_tensor([walls[at].centre_m for at in planes])).sum(-1)
+        flat = position @ normals.T - heights - radius[..., None]
+        if boxes:
+            flat = flat - ((normals @ turn).abs() * half[:, None]).sum(-1)
+        gaps[..., planes] = flat
     for at, wall in enumerate(walls):
-        centre = position.new_tensor(wall.centre_m)
         if wall.normal is not None:
-            normal = position.new_tensor(wall.normal)
-            extent = ((normal @ turn).abs() * half).sum(-1)
-            gaps[..., at] = (position - centre) @ normal - extent - radius
             continue
+        centre = position.new_tensor(wall.centre_m)
         fixed, size = rotated(position.new_tensor(wall.rotation)), position.new_tensor(wall.half_m)
         local = ((position - centre) @ fixed).abs() - size
         gap = local.clamp_min(0).norm(dim=-1) + local.amax(-1).clamp_max(0) - reach  # exact for spheres

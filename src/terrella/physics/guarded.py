@@ -345,11 +345,14 @@ def _done(state: State) -> Tensor:
 
 
 def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
-    """The violation of the last step by a law [B], in tolerances. fresh: episodes that have one step only."""
-    whole = one.law.residual(motion)[-1]
-    if fresh.any():
-        whole = torch.where(fresh, one.law.residual(motion.between(1, 3))[-1], whole)
-    return (whole / one.value).nan_to_num(nan=torch.inf)
+    """The violation of the last step by a law [B], in tolerances, judged once for each motion. fresh: episodes that have one step
+    only."""
+    if (ratio := motion.memo.get(one.law.name)) is None:
+        whole = one.law.residual(motion)[-1]
+        if fresh.any():
+            whole = torch.where(fresh, one.law.residual(motion.between(1, 3))[-1], whole)
+        ratio = motion.memo[one.law.name] = (whole / one.value).nan_to_num(nan=torch.inf)
+    return ratio
 
 
 def _way(motion: Trajectory) -> Tensor:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, wraps
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ from .gaps import body_gaps, wall_gaps
 from .system import PhysicalSystem, RigidBody, Slot
 
 SKIN = 0.02  # of a body's size: gaps below it count as contact
+Value = TypeVar("Value")
 REACH = 1.25  # times the way of a step, within which two bodies may have touched in between
 
 
@@ -31,6 +33,7 @@ class Trajectory:
     present: Tensor  # bool [T + 1, B, N]
     radius: Tensor  # [T + 1, B, N], m
     channels: Mapping[str, Tensor]  # [T + 1, B, K], as rendered
+    memo: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # of `once`
 
     @property
     def steps(self) -> int:
@@ -154,6 +157,18 @@ class Trajectory:
         """The instants first to stop - 1 alone."""
         parts = {name: getattr(self, name)[first:stop] for name in _PARTS}
         return replace(self, **parts, channels={name: part[first:stop] for name, part in self.channels.items()})
+
+
+def once(function: Callable[[Trajectory], Value]) -> Callable[[Trajectory], Value]:
+    """The same function of a motion, computed once for each motion: several laws need it."""
+
+    @wraps(function)
+    def kept(motion: Trajectory) -> Value:
+        if function not in motion.memo:
+            motion.memo[function] = function(motion)
+        return motion.memo[function]
+
+    return kept
 
 
 _PARTS = ("position", "velocity", "rotation", "spin", "present", "radius")

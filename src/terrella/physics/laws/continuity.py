@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ..system import PhysicalSystem
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, once
 from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
+@once
 def gentle(motion: Trajectory) -> Tensor:
     """bool [T, B, N]: steps in flight, or in which the velocity changes by no more than gravity changes it."""
     change = motion.velocity.diff(dim=0).norm(dim=-1)

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ..system import PhysicalSystem
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, once
 from .law import SINGLE, occasions, with_last
 
 
+@once
 def energy(motion: Trajectory) -> Tensor:
     """Kinetic and potential energy of the bodies that nothing drives [T + 1, B], J."""
     moving = motion.present & ~motion.driven
@@ -19,6 +20,7 @@ def energy(motion: Trajectory) -> Tensor:
     return ((kinetic + turning + potential) * moving).sum(-1)
 
 
+@once
 def energy_scale(motion: Trajectory) -> Tensor:
     """The largest kinetic energy so far, and the lift of all bodies by their own size [T + 1, B], J."""
     moving = motion.present & ~motion.driven

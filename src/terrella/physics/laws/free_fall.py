@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ..system import PhysicalSystem
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, once
 from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
+@once
 def ballistic(motion: Trajectory) -> Tensor:
     """bool [T, B, N]: steps in which the acceleration of a body is that of gravity. Velocities that are differences of positions
     need two such steps."""

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from ..system import PhysicalSystem
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, once
 from .law import SINGLE, largest, occasions, random_directions, shifted, with_last
 
 
+@once
 def closed_groups(motion: Trajectory) -> tuple[Tensor, Tensor]:
     """(bool [T, B, N, N]: bodies of one group, which touch each other in a chain; bool [T, B, N]: the body's group has two
     members or more, and nothing else touches it)."""

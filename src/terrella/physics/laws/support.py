@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from ..system import PhysicalSystem
-from ..trajectory import Trajectory
+from ..trajectory import Trajectory, once
 from .law import SINGLE, largest, occasions, shifted, with_last
 
 FAST = 5.0  # times what gravity changes in a step: slower arrivals may bounce twice in it
 
 
+@once
 def floor_forces(motion: Trajectory) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(bool [T, B, N]: the body may have touched one plane and nothing else; the force from it by mass, along its normal
     [T, B, N] and sideways [T, B, N, 3], m/s2; the normals [T, B, N, 3])."""
@@ -27,6 +28,7 @@ def floor_forces(motion: Trajectory) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return alone, along, force - along[..., None] * normal, normal
 
 
+@once
 def bounces(motion: Trajectory) -> tuple[Tensor, Tensor, Tensor]:
     """(bool [T, B, N]: the body hits one plane within the step, by its flight; the height above contact, m, and the speed along the
     normal, m/s, that a bounce with the body's restitution gives, each [T, B, N])."""
