@@ -47,8 +47,8 @@ class Fading:
         return {name: every[name] for name in channels}
 
 
-def test_the_level_is_a_quarter_of_the_way_to_chance():
-    assert trust_level(0.1, 0.5) == pytest.approx(0.2)
+def test_the_level_is_half_way_to_chance():
+    assert trust_level(0.1, 0.5) == pytest.approx(0.3)
     assert trust_level(0.6, 0.5) == 0.6, "a first step worse than chance is not trusted"
     assert chance_error(Fading().spec) == 0.4
     assert math.isnan(chance_error(Fading(card={}).spec)) and math.isnan(
@@ -65,24 +65,24 @@ def test_the_level_is_a_quarter_of_the_way_to_chance():
 
 def test_the_forecast_is_where_the_expected_error_reaches_the_level():
     found = forecast_trust(Fading(), 50)
-    assert found is not None and found.level == pytest.approx(0.01 + 0.39 / 4) and found.steps == 10 and found.ends
+    assert found is not None and found.level == pytest.approx(0.205) and found.steps == 20 and found.ends
     short = forecast_trust(Fading(), 5)
     assert short is not None and (short.steps, short.ends) == (5, False)
     other = forecast_trust(Fading(), 50, Fading().start(3, make_rng(0)))
-    assert other is not None and other.steps == 10
+    assert other is not None and other.steps == 20
     assert forecast_trust(Fading(card={}), 50) is None, "it cannot say how far off chance is"
 
 
 def test_planners_and_practice_stop_there_and_say_so():
     said: list[str] = []
-    search = SearchConfig(replan=20).filled(horizon=20)
+    search = SearchConfig(replan=40).filled(horizon=40)
     cut = search_within_trust(Fading(), search, said.append)
-    assert (cut.horizon, cut.replan) == (10, 10) and "not trusted beyond 10 of 20 steps" in said[0]
-    assert search_within_trust(Fading(), SearchConfig(block=4).filled(), said.append).horizon == 2
-    practice = practice_within_trust(Fading(), Practice(), said.append)
-    assert practice.horizon == 10 and "rollouts end there" in said[-1]
+    assert (cut.horizon, cut.replan) == (20, 20) and "not trusted beyond 20 of 40 steps" in said[0]
+    assert search_within_trust(Fading(), SearchConfig(block=4).filled(), said.append).horizon == 5
+    practice = practice_within_trust(Fading(), Practice(horizon=40), said.append)
+    assert practice.horizon == 20 and "rollouts end there" in said[-1]
     count = len(said)
-    assert search_within_trust(Fading(), replace(search, trust=0.3), said.append).horizon == 20, "somebody set a limit"
+    assert search_within_trust(Fading(), replace(search, trust=0.3), said.append).horizon == 40, "somebody set a limit"
     assert practice_within_trust(Fading(), Practice(trust=0.3), said.append).horizon is None
     assert practice_within_trust(Fading(), Practice(horizon=5), said.append).horizon == 5
     assert search_within_trust(Fading(card={}), search, said.append) == search, "a world that cannot say"
@@ -93,12 +93,12 @@ def black(steps: int) -> Clip:
     return Clip({"rgb": np.zeros((steps, 4, 4, 3), np.uint8)}, np.zeros(steps, np.int64), 2, 0, 0)
 
 
-@pytest.mark.parametrize("off, steps", [(0.01, 10), (0.02, 5), (0.001, 30)])
+@pytest.mark.parametrize("off, steps", [(0.01, 20), (0.02, 10), (0.001, 30)])
 def test_the_scorecard_has_the_forecast_beside_the_measured_horizon(off, steps):
     config = ExamConfig(horizons=(30,), control_horizons=(), long_steps=0, still_steps=0, speed_steps=0)
     card = examine(Exam({"a": Fading(off)}, {CLIPS: {"recorded": [black(32)] * 2}}, config), probes=(TRUST,))
     (forecast,), (measured,) = (card.find("trust", f"trust horizon, {what}") for what in ("forecast", "measured"))
-    assert (forecast.figure.value, measured.figure.value) == (10, steps)
+    assert (forecast.figure.value, measured.figure.value) == (20, steps)
     assert ("not reached" in measured.note) == (steps == 30)
 
 

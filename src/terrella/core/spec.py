@@ -219,8 +219,8 @@ def chance_error(spec: Spec) -> float:
 
 
 def trust_level(first: float, chance: float) -> float:
-    """The error at which trust in a rollout ends: a quarter of the way from `first`, that of its first step, to `chance`."""
-    return first + 0.25 * max(chance - first, 0.0)
+    """The error at which trust in a rollout ends: half way from `first`, that of its first step, to `chance`."""
+    return first + 0.5 * max(chance - first, 0.0)
 
 
 def neutral_action(spec: Spec) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The trust horizon of a world: for how many steps a rollout is nearer to the truth than to chance, forecast and measured.
 
-Trust ends where the mean error is a quarter of the way from that of the first step to that of chance, which is what two random
+Trust ends where the mean error is half way from that of the first step to that of chance, which is what two random
 observations differ by. The forecast needs no truth: it takes the world's own `uncertainty` in a rollout.
 """
 
@@ -22,7 +22,7 @@ from .statistics import Figure
 
 ROLLOUTS, HOLD = 8, (3, 40)  # of a forecast; steps for which its random actions are held
 LEAD = (
-    "Trust ends where the mean error is a quarter of the way from that of the first step to that of chance: what two random "
+    "Trust ends where the mean error is half way from that of the first step to that of chance: what two random "
     "observations differ by. Forecast: by the error that the world itself expects. Measured: by the error that it has."
 )
 

@@ -35,6 +35,6 @@ def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
         return steps
     progress(
         f"{world.spec.name} is not trusted beyond {forecast.steps} of {steps} steps: there it expects an error of "
-        f"{forecast.level:.2g}, a quarter of the way to chance. Its {what} end there; --trust sets another limit."
+        f"{forecast.level:.2g}, half way to chance. Its {what} end there; --trust sets another limit."
     )
     return forecast.steps

@@ -38,6 +38,6 @@ export class Uncertainty {
     this.root.ariaValueNow = this.value;
     this.root.title = `${WORDS[this.level]}. Expected error of the picture: ${percent(this.value)} of full brightness by invention, `
       + `${percent(this.drifted)} by a position that has drifted. `
-      + (beyond ? 'Beyond trust: a quarter of the way to a random picture' : 'Within trust');
+      + (beyond ? 'Beyond trust: nearer to a random picture than to the true one' : 'Within trust');
   }
 }
