@@ -56,8 +56,8 @@ def rows_of(timed: Results, arm: str, place: str, dt_s: float) -> list[Row]:
         ("95th percentile", late, "ms", threads),
         ("growth", 100 * (last / first - 1), "%", threads),
         ("energy of a frame", float(timed["joules"][0]), "J", energy),
-        ("memory of a session", float(timed["memory"][1, -1]) / 2**20, "MiB", ""),
-        ("memory added per minute of play", growth(timed["memory"]) * 60 / dt_s / 2**20, "MiB", ""),
+        ("memory of a session", float(timed["memory"][1, -1]) / 2**10, "KiB", ""),
+        ("memory added per minute of play", growth(timed["memory"]) * 60 / dt_s / 2**10, "KiB", ""),
     ]
     return [
         Row("speed", "", what, unit, place, arm, PREDICTED, steps, Figure(value, math.nan, math.nan, 1), -1, note=note)
