@@ -15,7 +15,7 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.core.rollouts import advance
 from terrella.data import Recorder
-from terrella.learn.latent_validation import effective_rank, encode_rows, linear_probe, state_at
+from terrella.learn.latent_validation import ARMS, effective_rank, encode_rows, linear_probe, state_at, verdict
 from terrella.learn.objectives.latent_prediction import sigreg
 from terrella.learn.recipes import latent
 from terrella.learn.recipes.latent import LatentTraining, train_latent
@@ -235,6 +235,22 @@ def test_figures_of_latents_whose_answers_are_known():
     assert linear_probe(latents[:1000], told[:1000], latents[1000:], told[1000:]) > 0.99
     noise = torch.randn(2000, 2, generator=rng)
     assert linear_probe(latents[:1000], noise[:1000], latents[1000:], noise[1000:]) < 0.1
+
+
+def test_the_verdict_says_how_far_to_plan_and_what_is_lost():
+    def arms(true, other, still):
+        return {
+            ARMS[0]: {"1": true, "8": 2 * true},
+            ARMS[1]: {"1": other, "8": 2 * other},
+            ARMS[2]: {"1": still, "8": still},
+        }
+
+    assert verdict(arms(0.1, 0.3, 0.4), {"place": 0.9, "speed": 0.2}) == (
+        "Better than copy-last after 8 steps; what it predicts depends on the actions after 8. Its latents do not hold speed."
+    )
+    assert "after 1 step;" in verdict(arms(0.3, 0.6, 0.4), {})
+    assert "hardly depends on the actions" in verdict(arms(0.1, 0.1, 0.4), {})
+    assert "do not plan in it" in verdict(arms(0.5, 0.6, 0.4), {})
 
 
 def test_fewer_clips_than_a_batch_are_one_batch(tmp_path):

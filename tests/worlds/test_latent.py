@@ -42,6 +42,8 @@ KINDS = {
     "a recording without vectors": {"vectors": ()},
     "no history": {"history": 1},
     "leaps": {"leap": 4},
+    "three pictures": {"frames": 3, "glance": 6},
+    "three pictures alone, and leaps": {"frames": 3, "sees_vectors": False, "leap": 4},
 }
 
 
@@ -217,3 +219,16 @@ def test_uncertainty_rises_with_the_spread_and_is_none_of_what_was_seen():
         state = world.imagine(state, world.spec.sample_action(1, rng), rng)
         levels.append(float(world.render(state, ("uncertainty",))["uncertainty"]))
     assert levels[0] == 0 and levels == sorted(levels) and 0 < levels[-1] <= 1
+
+
+@pytest.mark.parametrize(("before", "counts"), [(1, True), (2, True), (3, False)])
+def test_a_latent_is_made_of_the_pictures_of_the_last_three_steps(before, counts):
+    world, rng = made(frames=3, sees_vectors=False), make_rng(0)
+    pictures = torch.randint(0, 255, (3, 32, 48, 3), dtype=torch.uint8, generator=rng)
+    state = world.observe({"rgb": pictures[:2]}, None, rng)
+    for _ in range(before):
+        state = world.imagine(state, world.spec.sample_action(2, make_rng(1))[:1].expand(2, -1), rng)
+        state = state.replace(done=torch.zeros(2, dtype=torch.bool))
+    after = world.observe({"rgb": pictures[2:].expand(2, -1, -1, -1)}, state, rng)["window"][:, -1]
+    assert torch.allclose(after[0], after[1], atol=1e-5) != counts
+    assert torch.equal(after, world.observe({"rgb": pictures[2:].expand(2, -1, -1, -1)}, state, rng)["window"][:, -1])

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ..core.errors import DatasetError
 from ..core.state import State
 from ..core.world import World, make_rng
-from ..worlds.latent import LatentWorld
+from ..worlds.latent import FORGOTTEN, LatentWorld
 from ..worlds.latent_network import KNOTS
 from .calibration import isotonic
 from .objectives.uncertainty import rank_correlation
@@ -20,6 +20,8 @@ from .recording import Recording
 
 HORIZONS = (1, 8, 16)
 CLIPS = 256  # over which open-loop errors are averaged
+CLEARLY = 0.9  # share of another error below which an error is clearly less
+HELD = 0.5  # R² of a linear probe from which latents hold a vector
 PROBED = 4096  # rows to which linear probes are fitted
 ARMS = ("true actions", "another's actions", "copy-last")
 
@@ -56,11 +58,25 @@ def held_out_rows(recording: Recording) -> Recording:
 
 @torch.inference_mode()
 def encode_rows(world: LatentWorld, recording: Recording, rows: np.ndarray) -> torch.Tensor:
-    """Latents [n, D] of rows of a recording."""
-    parts = np.array_split(rows, max(1, -(-len(rows) // 512)))
-    return torch.cat(
-        [world.observe(observation_at(world, recording, some), None, make_rng(0))["window"][:, -1] for some in parts]
-    )
+    """Latents [n, D] of rows of a recording, and of what is before them in their episodes."""
+    parts, latents = np.array_split(rows, max(1, -(-len(rows) // 512))), []
+    for some in parts:
+        seen, prior = observation_at(world, recording, some), _prior(world, recording, some)
+        latents.append(world.observe(seen, prior, make_rng(0))["window"][:, -1])
+    return torch.cat(latents)
+
+
+def _prior(world: LatentWorld, recording: Recording, rows: np.ndarray) -> State | None:
+    """A state that has seen the pictures before rows, where latents are made of several."""
+    network, config = world.network, world.network.config
+    if not config.pictured or config.frames == 1:
+        return None
+    back = np.arange(1, config.frames)
+    at = rows[:, None] - back
+    known = torch.from_numpy(at >= recording.start[rows][:, None]).to(world.device)
+    looks = network.look(recording.rgb(np.maximum(at, 0).ravel()).to(world.device))
+    ages = torch.where(known, torch.from_numpy(back).to(world.device), FORGOTTEN)
+    return world.start(len(rows), make_rng(0)).replace(glances=network.glance(looks).unflatten(0, at.shape), ages=ages)
 
 
 @torch.inference_mode()
@@ -104,8 +120,8 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
 
 
 def validate(world: LatentWorld, recording: Recording, horizons: Sequence[int] = HORIZONS) -> dict[str, Any]:
-    """JSON facts. errors: see OpenLoop.table; probe_r2: R² of a linear probe of each vector; effective_rank of the latents, and
-    their dimensions; uncertainty_rank_correlation: of the expected with the actual error."""
+    """JSON facts, the verdict first. errors: see OpenLoop.table; probe_r2: R² of a linear probe of each vector; effective_rank of
+    the latents, and their dimensions; uncertainty_rank_correlation: of the expected with the actual error."""
     rolled = open_loop(world, recording, horizons)
     rows = _some(recording, PROBED)
     held = np.flatnonzero(held_out_rows(recording).usable)
@@ -117,13 +133,33 @@ def validate(world: LatentWorld, recording: Recording, horizons: Sequence[int] =
     }
     error = torch.cat([rolled.latent[ARMS[0], step] for step in rolled.steps])
     expected = world.network.expected(torch.cat([rolled.spread[step] for step in rolled.steps]))
+    table = _rounded(rolled.table())
     return {
-        "errors": _rounded(rolled.table()),
+        "verdict": verdict(table["latent"], probe),
+        "errors": table,
         "probe_r2": _rounded(probe),
         "effective_rank": round(effective_rank(fitted), 2),
         "latent": fitted.shape[1],
         "uncertainty_rank_correlation": round(rank_correlation(expected, error), 3),
     }
+
+
+def verdict(errors: Mapping[str, Mapping[str, float]], probe: Mapping[str, float]) -> str:
+    """A sentence or two: how far ahead it can be planned in, by the latent's errors of each arm and step, and what latents lack, by
+    the R² of each vector's linear probe."""
+    true, other, still = (errors[arm] for arm in ARMS)
+    predicts = [step for step in true if true[step] < CLEARLY * still[step]]
+    obeys = [step for step in predicts if true[step] < CLEARLY * other[step]]
+    if not predicts:
+        words = "It predicts no better than copy-last: do not plan in it. Train longer (--steps), or record more."
+    elif not obeys:
+        words = "It predicts better than copy-last, but hardly depends on the actions: plans in it cannot be expected to work."
+    else:
+        last = f"{predicts[-1]} step{'s'[: int(predicts[-1]) > 1]}"
+        words = f"Better than copy-last after {last}; what it predicts depends on the actions after {obeys[-1]}."
+    if lost := [name for name, share in probe.items() if share < HELD]:
+        words += f" Its latents do not hold {', '.join(lost)}."
+    return words
 
 
 def calibrate(world: LatentWorld, recording: Recording, horizons: Sequence[int] = (1, 2, 4, 8, 16, 32)) -> None:

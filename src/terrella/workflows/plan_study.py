@@ -233,6 +233,9 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
         refuse(config, "a reward is summed up to the end of the episode", "cost")
     whole = config.search.filled().horizon
     search = config.search.filled(replan=whole) if config.cost == "last" else config.search.filled()
+    validation = world.spec.card.get("validation")
+    if isinstance(validation, dict) and "verdict" in validation:
+        progress(f"{world.spec.name}: {validation['verdict']}")
     if config.agent is None:
         search = search_within_trust(world, search, progress)
         planner_of(world, goal, config, search)  # refuses what does not fit, before anything is played

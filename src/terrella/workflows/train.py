@@ -21,7 +21,9 @@ class TrainResult:
         return jsonable(self.facts)
 
     def summary(self) -> str:
-        return "\n".join(f"{name}: {value}" for name, value in self.facts.items())
+        facts = {**self.facts}
+        verdict = [facts.pop("verdict")] if "verdict" in facts else []
+        return "\n".join([*verdict, *(f"{name}: {value}" for name, value in facts.items())])
 
 
 def train_video(

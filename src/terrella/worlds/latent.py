@@ -20,18 +20,20 @@ from ..core.errors import ContractError, ObservationError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of
 from ..core.state import State
 from .controls import AXES
-from .latent_network import FARTHEST, LatentNetwork
+from .latent_network import FARTHEST, LatentNetwork, Looks
 from .learned import About
 from .parts import STARTS, check_prior, picture_of
 
+FORGOTTEN = 2**20  # steps: the age of no picture
 UNIT = "expected error of the latent, 0 exact to 1 no better than its mean"
 
 
 @final
 class LatentWorld:
     """State: window [B, K, D], the last latents, the newest last; actions [B, K - 1, A] between them; reward, done,
-    done_probability; spread, the ensemble's variance summed since the last evidence. starts: latents [N, D] with which
-    episodes begin. A step is deterministic."""
+    done_probability; spread, the ensemble's variance summed since the last evidence; where a latent is made of F pictures also
+    glances [B, F - 1, G] of the last ones, the newest first, their ages [B, F - 1] in steps (-1: none). starts: latents [N, D] with
+    which episodes begin. A step is deterministic."""
 
     def __init__(self, about: About, network: LatentNetwork, starts: torch.Tensor):
         self.about, self.controls = about, about.controls
@@ -99,13 +101,13 @@ class LatentWorld:
         lacks = [name for name in self.spec.observes if name not in observation]
         if lacks:
             raise ObservationError(f"{self.spec.name} observes {', '.join(lacks)}, which the observation lacks.")
-        rgb = numbers = None
+        look = numbers = None
         network, config = self.network, self.network.config
         if config.pictured:
             assert config.size is not None
-            rgb = picture_of(observation, config.size, self.device)
+            look = network.look(picture_of(observation, config.size, self.device))
         given = {name: self._vector(name, observation[name]) for name in config.seen if name in observation}
-        batches = {len(part) for part in (rgb, *given.values()) if part is not None}
+        batches = {len(part) for part in (look, *given.values()) if part is not None}
         if len(batches) != 1:
             raise ObservationError(
                 f"the channels of an observation are of one batch; got batches of {sorted(batches)}."
@@ -114,7 +116,18 @@ class LatentWorld:
             blank = network.mean.expand(next(iter(batches)), -1)
             parts = blank.split([width for _, width in config.vectors], 1)
             numbers = torch.cat([given.get(name, part) for (name, _), part in zip(config.vectors, parts)], 1)
-        return self._begun(network.encode(rgb, numbers), prior)
+        if look is None:
+            return self._begun(network.encode(None, numbers), prior)
+        if prior is not None:
+            check_prior(prior.batch, len(look))
+        looks = self._looks(look, prior)
+        state = self._begun(network.encode(looks, numbers), prior)
+        if config.frames == 1:
+            return state
+        glances = torch.cat([network.glance(look)[:, None], looks.past[:, :-1]], 1)
+        ages = torch.arange(config.frames - 1, device=self.device).expand(len(look), -1)
+        seen = torch.cat([torch.ones_like(looks.known[:, :1]), looks.known[:, :-1]], 1)
+        return state.replace(glances=glances, ages=torch.where(seen > 0, ages, FORGOTTEN))
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
         """One step. Episodes that are over stand still."""
@@ -135,6 +148,8 @@ class LatentWorld:
             "done_probability": outcome.done.sigmoid(),
             "spread": state["spread"] + members.var(0, correction=0).mean(1),
         }
+        if "ages" in state:
+            after["ages"] = state["ages"] + 1
         held = {"reward": torch.zeros_like(state["reward"])}
         kept = {}
         for name, now in after.items():
@@ -150,7 +165,8 @@ class LatentWorld:
         still = state["done"].view(-1, 1, 1)
         window = torch.where(still, state["window"], self.network.leap(state["window"], past))
         kept = past[:, past.shape[1] - state["actions"].shape[1] :]
-        return state.replace(window=window, actions=torch.where(still, state["actions"], kept))
+        ages = {"ages": state["ages"] + self.spec.leap} if "ages" in state else {}
+        return state.replace(window=window, actions=torch.where(still, state["actions"], kept), **ages)
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)
@@ -159,6 +175,16 @@ class LatentWorld:
         return {name: numbers[name] if name in vectors else self._shown(state, name) for name in channels}
 
     # -- inside -------------------------------------------------------------------------------------------------------
+
+    def _looks(self, look: torch.Tensor, prior: State | None) -> Looks:
+        """Of pictures with features `look` [B, hidden], and of the pictures one step before them, two, and so on."""
+        config = self.network.config
+        if prior is None or config.frames == 1:
+            past = look.new_zeros(len(look), config.frames - 1, config.glance)
+            return Looks(look, past, past[..., 0])
+        steps = torch.arange(1, config.frames, device=self.device)
+        match = (prior["ages"][:, None] == steps[:, None]).float()  # [B, steps, glances]
+        return Looks(look, match @ prior["glances"], match.sum(2))
 
     def _begun(self, latent: torch.Tensor, prior: State | None) -> State:
         config, batch = self.network.config, len(latent)
@@ -171,12 +197,14 @@ class LatentWorld:
             window, actions = torch.cat([prior["window"][:, :-1], latent[:, None]], 1), prior["actions"]
         nothing = latent.new_zeros(batch)
         done = torch.zeros(batch, dtype=torch.bool, device=latent.device)
-        return State(
-            {
-                "window": window, "actions": actions, "reward": nothing, "done": done, "done_probability": nothing,
-                "spread": nothing,
-            }
-        )  # fmt: skip
+        state = {
+            "window": window, "actions": actions, "reward": nothing, "done": done, "done_probability": nothing,
+            "spread": nothing,
+        }  # fmt: skip
+        if config.pictured and config.frames > 1:
+            state["glances"] = latent.new_zeros(batch, config.frames - 1, config.glance)
+            state["ages"] = torch.full((batch, config.frames - 1), FORGOTTEN, device=self.device)
+        return State(state)
 
     def _vector(self, name: str, given: torch.Tensor) -> torch.Tensor:
         width = dict(self.network.config.vectors)[name]

@@ -1,7 +1,7 @@
 """The networks of a latent world: encoder, predictor, heads and, for people, a decoder (LeWorldModel, Maes et al. 2026)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -30,6 +30,8 @@ class LatentConfig:
     members: int = 3  # predictors of the ensemble
     leap: int = 0  # steps of a leap, 0 without
     identity: bool = False  # the latent is the scaled vectors, all of which are evidence; there is no encoder
+    frames: int = 1  # last pictures that a latent is made of
+    glance: int = 64  # width of what is kept of a picture for the latents after it
 
     @property
     def width(self) -> int:
@@ -60,8 +62,17 @@ class Outcomes(NamedTuple):
     done: torch.Tensor
 
 
+class Looks(NamedTuple):
+    """Features of the last pictures at N moments."""
+
+    newest: torch.Tensor  # [N, hidden]
+    past: torch.Tensor  # [N, frames - 1, glance], of those before it, the newest first
+    known: torch.Tensor  # [N, frames - 1], 0 where there is none
+
+
 class LatentEncoder(nn.Module):
-    """Picture and numbers to a latent; its projector ends in BatchNorm and one linear layer, as SIGReg asks for."""
+    """The last pictures and numbers to a latent; its projector ends in BatchNorm and one linear layer, as SIGReg asks for. Of the
+    pictures before the newest it sees by how much they differ from it, each number by its own deviation: velocities are there."""
 
     def __init__(self, config: LatentConfig):
         super().__init__()
@@ -73,6 +84,10 @@ class LatentEncoder(nn.Module):
             layers = [part for a, b in zip(widths, widths[1:]) for part in (nn.Conv2d(a, b, 4, 2, 1), nn.SiLU())]
             self.look = nn.Sequential(*layers, nn.Flatten(), nn.Linear(widths[-1] * cells, hidden), nn.SiLU())
             width += hidden
+            if config.frames > 1:
+                past = (config.frames - 1) * config.glance
+                self.glance, self.change = nn.Linear(hidden, config.glance), nn.BatchNorm1d(past, affine=False)
+                width += past + config.frames - 1
         if config.columns:
             first = nn.Linear(len(config.columns) + 1, hidden)
             self.sense = nn.Sequential(first, nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU())
@@ -80,11 +95,14 @@ class LatentEncoder(nn.Module):
         layers = nn.Linear(width, hidden), nn.BatchNorm1d(hidden), nn.SiLU(), nn.Linear(hidden, config.latent)
         self.project = nn.Sequential(*layers)
 
-    def forward(self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, known: torch.Tensor | None):
-        """rgb uint8 [N, 3, H, W]; numbers [N, S], scaled; known [N]: 0 where the numbers are not. Returns [N, D]."""
+    def forward(self, looks: Looks | None, numbers: torch.Tensor | None, known: torch.Tensor | None):
+        """looks of N moments; numbers [N, S], scaled; known [N]: 0 where the numbers are not. Returns [N, D]."""
         parts = []
-        if rgb is not None:
-            parts.append(self.look((rgb.float() / 127.5 - 1).contiguous(memory_format=torch.channels_last)))
+        if looks is not None:
+            parts.append(looks.newest)
+            if looks.past.shape[1]:
+                change = self.change((self.glance(looks.newest)[:, None] - looks.past).flatten(1))
+                parts += [(change.view_as(looks.past) * looks.known[..., None]).flatten(1), looks.known]
         if numbers is not None:
             known = numbers.new_ones(len(numbers)) if known is None else known.float()
             parts.append(self.sense(torch.cat([numbers * known[:, None], known[:, None]], 1)))
@@ -128,8 +146,8 @@ def _normed(x: torch.Tensor) -> torch.Tensor:
 
 
 class Decoder(nn.Module):
-    """A latent as a picture, for people; no gradient goes from it to latents. Most of its layers are at low resolution (sub-pixel
-    convolution, Shi et al. 2016)."""
+    """A latent as a picture: for people, and in training so that latents of pictures hold what one sees. Most of its layers are at
+    low resolution (sub-pixel convolution, Shi et al. 2016)."""
 
     def __init__(self, latent: int, size: tuple[int, int]):
         super().__init__()
@@ -162,7 +180,7 @@ class LatentNetwork(nn.Module):
         super().__init__()
         self.config = config
         latent, hidden, window = config.latent, config.hidden, config.history * config.latent
-        self.encoder = nn.Identity() if config.identity else LatentEncoder(config)
+        self.encoder: Any = nn.Identity() if config.identity else LatentEncoder(config)
         self.predictor = Ensemble(config.members, window + config.history * config.actions, hidden, latent)
         self.heads = nn.ModuleDict(
             {
@@ -187,20 +205,28 @@ class LatentNetwork(nn.Module):
         """Numbers [..., width] in standard deviations from their mean."""
         return ((numbers - self.mean) / self.scale).clamp(-FARTHEST, FARTHEST)
 
+    def look(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Features [N, hidden] of pictures, uint8 [N, 3, H, W]."""
+        return self.encoder.look((rgb.float() / 127.5 - 1).contiguous(memory_format=torch.channels_last))
+
+    def glance(self, look: torch.Tensor) -> torch.Tensor:
+        """What is kept [N, glance] of a picture's features for the latents after it."""
+        return self.encoder.glance(look) if self.config.frames > 1 else look[:, :0]
+
     def encode(
-        self, rgb: torch.Tensor | None, numbers: torch.Tensor | None, known: torch.Tensor | None = None
+        self, looks: Looks | None, numbers: torch.Tensor | None, known: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Evidence to latents [N, D]: rgb uint8 [N, 3, H, W] where pictures are evidence; numbers [N, width] as recorded, of all
-        vectors; known [N]: whether they are known, which beside a picture they need not be."""
+        """Evidence to latents [N, D]: looks, where pictures are evidence; numbers [N, width] as recorded, of all vectors; known
+        [N]: whether they are known, which beside a picture they need not be."""
         seen = None
         if self.config.columns:
             if numbers is None:
-                assert rgb is not None
-                numbers, known = self.mean.expand(len(rgb), -1), torch.zeros(len(rgb), device=rgb.device)
+                assert looks is not None
+                numbers, known = self.mean.expand(len(looks.newest), -1), looks.newest.new_zeros(len(looks.newest))
             seen = self.scaled(numbers)[:, self.config.columns]
             if self.config.identity:
                 return seen
-        return self.encoder(rgb if self.config.pictured else None, seen, known)
+        return self.encoder(looks, seen, known)
 
     def predict(self, window: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         """The next latent of each member [members, B, D], after actions [B, K, A], the newest last."""

@@ -1,7 +1,8 @@
 """Latent prediction: the next latents from the last ones and the actions, kept from collapsing by SIGReg.
 
 The encoder makes its own targets, without a moving average or a stopped gradient: collapse is prevented by a penalty on
-projections of the latents that are not standard normal (LeJEPA, Balestriero & LeCun 2025; LeWorldModel, Maes et al. 2026).
+projections of the latents that are not standard normal (LeJEPA, Balestriero & LeCun 2025; LeWorldModel, Maes et al. 2026). Latents
+of pictures are decoded, too, so that they hold what one sees.
 """
 
 from collections.abc import Iterator, Mapping
@@ -13,7 +14,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ...worlds.controls import AXES, BUTTONS, Controls
-from ...worlds.latent_network import LatentConfig, LatentNetwork
+from ...worlds.latent_network import LatentConfig, LatentNetwork, Looks
 from ..trainer import Loss, TrainStep, adamw, warmup_cosine
 from .outcome import two_hot
 
@@ -61,6 +62,18 @@ def latent_clips(
     return LatentClips(rgb, *(part.to(device) for part in (numbers, encoded, reward, done)))
 
 
+def clip_looks(network: LatentNetwork, rgb: torch.Tensor) -> Looks:
+    """Features of the pictures of clips, uint8 [B, L, 3, H, W], and of those before each in its clip: [B, L, ...]."""
+    count, length = rgb.shape[:2]
+    newest = network.look(rgb.flatten(0, 1))
+    glance, newest = network.glance(newest).unflatten(0, (count, length)), newest.unflatten(0, (count, length))
+    before = range(1, network.config.frames)
+    past = [F.pad(glance, (0, 0, back, 0))[:, :length] for back in before]
+    known = [(torch.arange(length, device=rgb.device) >= back).float().expand(count, -1) for back in before]
+    empty = newest.new_zeros(count, length, 0)
+    return Looks(newest, torch.stack(past, 2) if past else empty[..., None], torch.stack(known, 2) if known else empty)
+
+
 def sigreg(latents: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
     """The Epps-Pulley statistic (1983) of latents [N, D], projected on unit directions [D, P], against a standard normal: N times
     the squared distance of the characteristic functions under a Gaussian window; its mean over directions."""
@@ -79,52 +92,67 @@ class LatentPrediction:
     def __init__(self, network: LatentNetwork, controls: Controls, learning_rate: float, steps: int):
         self.network, self.controls, self.steps = network, controls, steps
         self.modules = {"network": network}
-        parts = (network.encoder, network.predictor, network.heads, network.leaper)
+        parts = (network.encoder, network.predictor, network.heads, network.leaper, network.decoder)
         trained = [part for part in parts if parameters(part)]
         self.learners = {"latent": adamw(trained, warmup_cosine(learning_rate, 100, 0.02))}
-        if network.config.size:
-            self.learners["decoder"] = adamw((network.decoder,), warmup_cosine(learning_rate, 100, 0.02))
 
     def losses(self, batch: LatentClips, now: TrainStep) -> Iterator[Loss]:
-        network, config = self.network, self.network.config
-        latents = self._encode(batch, now)
-        windows, predicted, error = self._rollout(latents, batch, now)
+        config = self.network.config
+        latents, blind = self._encode(batch, now)
+        windows, predicted, error = self._rollout(latents, blind, batch, now)
         parts = {"prediction": error}
+        if (
+            config.pictured and config.frames > 1
+        ):  # so that a single picture, such as a goal, is near the same one in motion
+            parts["blind"] = (blind - latents[:, config.history - 1].detach()).square().mean()
         if not config.identity:  # which cannot collapse
             parts["sigreg"] = self._sigreg(latents, now)
         if config.leap:
-            parts["leap"] = self._leap_error(latents, batch, now)
+            parts["leap"] = self._leap_error(latents, blind, batch, now)
+        if batch.rgb is not None:
+            decoded = latents if config.pictured else latents.detach()  # of numbers, pictures are for people alone
+            parts["picture"] = self._picture_loss(decoded, batch.rgb, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
         parts |= self._head_losses(real, torch.stack(windows, 1), torch.stack(predicted, 1), latents, batch)
         weights = {"sigreg": SIGREG, "numbers": NUMBERS_WEIGHT, "inverse": INVERSE_WEIGHT}
         weights |= {"reward": OUTCOME_WEIGHT, "done": OUTCOME_WEIGHT}
         terms = (weights.get(name, 1.0) * part for name, part in parts.items())
         yield Loss("latent", sum(terms, error.new_zeros(())), parts)
-        if batch.rgb is not None:
-            some = now.rng.permutation(latents.shape[0] * latents.shape[1])[:DECODED]
-            picked = torch.from_numpy(some).to(now.device)
-            decoded = network.decoder(latents.detach().flatten(0, 1)[picked])
-            parts = {"picture": picture_loss(decoded, batch.rgb.flatten(0, 1)[picked].float() / 255)}
-            yield Loss("decoder", parts["picture"], parts)
 
-    def _encode(self, batch: LatentClips, now: TrainStep) -> torch.Tensor:
-        """Latents [B, L, D]; beside pictures the vectors of some clips are hidden."""
-        shape, config = batch.reward.shape, self.network.config
+    def _picture_loss(self, latents: torch.Tensor, rgb: torch.Tensor, now: TrainStep) -> torch.Tensor:
+        """Of some latents [B, L, D], decoded, in shares of what pictures [B, L, 3, H, W] differ by: a latent without what one sees
+        of a thing that moves predicts as well, and cannot be planned with."""
+        some = torch.from_numpy(now.rng.permutation(latents.shape[0] * latents.shape[1])[:DECODED]).to(now.device)
+        shown, varies = (part.float() / 255 for part in (rgb.flatten(0, 1)[some], rgb[:, 0]))
+        error = picture_loss(self.network.decoder(latents.flatten(0, 1)[some]), shown)
+        return error / varies.var(0).mean().clamp_min(1e-4)
+
+    def _encode(self, batch: LatentClips, now: TrainStep) -> tuple[torch.Tensor, torch.Tensor]:
+        """Latents [B, L, D], and those [B, D] of the last row of the history without the pictures before it; beside pictures the
+        vectors of some clips are hidden."""
+        (count, length), config = batch.reward.shape, self.network.config
+        rows = [*range(length), self.network.config.history - 1]
         visible = None
         if config.pictured and config.columns:
-            seen = torch.from_numpy(now.rng.random(shape[0]) >= NO_VECTORS).to(now.device)
-            visible = seen[:, None].expand(shape).flatten()
-        rgb = None if batch.rgb is None else batch.rgb.flatten(0, 1)
-        return self.network.encode(rgb, batch.numbers.flatten(0, 1), visible).unflatten(0, shape)
+            given = torch.from_numpy(now.rng.random(count) >= NO_VECTORS).to(now.device)
+            visible = given[:, None].expand(count, len(rows)).flatten()
+        looks = None
+        if config.pictured:
+            assert batch.rgb is not None
+            seen = Looks(*(part[:, rows] for part in clip_looks(self.network, batch.rgb)))
+            seen.known[:, -1] = 0
+            looks = Looks(*(part.flatten(0, 1) for part in seen))
+        latents = self.network.encode(looks, batch.numbers[:, rows].flatten(0, 1), visible).unflatten(0, (count, -1))
+        return latents[:, :-1], latents[:, -1]
 
     def _rollout(
-        self, latents: torch.Tensor, batch: LatentClips, now: TrainStep
+        self, latents: torch.Tensor, blind: torch.Tensor, batch: LatentClips, now: TrainStep
     ) -> tuple[list[torch.Tensor], list[torch.Tensor], torch.Tensor]:
         """The windows [B, K, D] before each step and after the last, the ensemble's mean prediction [B, D] of each step, and the
         mean error of the members. Each member learns from clips of its own draw, so that members differ where data is scarce."""
         network, history = self.network, self.network.config.history
         alone = torch.from_numpy(now.rng.random((len(latents), 1, 1)) < NO_PAST).to(now.device)
-        window = torch.where(alone, latents[:, history - 1 : history], latents[:, :history])
+        window = torch.where(alone, blind[:, None], latents[:, :history])
         past = torch.where(alone, 0.0, batch.actions[:, : history - 1])
         members = network.config.members
         mask = torch.from_numpy(now.rng.random((members, len(latents), 1)) < BAGGING).to(now.device).float()
@@ -139,7 +167,9 @@ class LatentPrediction:
         windows.append(window)
         return windows, predicted, error / self.steps
 
-    def _leap_error(self, latents: torch.Tensor, batch: LatentClips, now: TrainStep) -> torch.Tensor:
+    def _leap_error(
+        self, latents: torch.Tensor, blind: torch.Tensor, batch: LatentClips, now: TrainStep
+    ) -> torch.Tensor:
         """The mean error of a leap from one row of each clip."""
         network, config = self.network, self.network.config
         length = config.history + config.leap
@@ -147,7 +177,8 @@ class LatentPrediction:
         spans, actions = latents[:, at : at + length], batch.actions[:, at : at + length - 1]
         alone = torch.from_numpy(now.rng.random((len(spans), 1, 1)) < NO_PAST).to(now.device)
         first = config.history - 1
-        window = torch.where(alone, spans[:, first : first + 1], spans[:, : config.history])
+        lone = spans[:, first] if at else blind
+        window = torch.where(alone, lone[:, None], spans[:, : config.history])
         actions = torch.cat([torch.where(alone, 0.0, actions[:, :first]), actions[:, first:]], 1)
         return self._errors(network.leap(window, actions), spans[:, config.leap :]).mean()
 

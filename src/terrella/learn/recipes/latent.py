@@ -56,6 +56,8 @@ class LatentTraining:
     latent: int | None = None
     # Past latents and actions that the predictor sees. 1 is enough, and fast, where the vectors contain velocities.
     history: int = 3
+    # Last pictures that a latent is made of; one picture shows no velocity.
+    frames: int = 3
     hidden: int = 192  # Width of the hidden layers.
     # Predictors in the ensemble, whose disagreement is the uncertainty; with 1 there is none.
     members: int = 3
@@ -186,6 +188,7 @@ class _Training:
             hidden=config.hidden,
             members=config.members,
             leap=self._leap(),
+            frames=config.frames if pictured else 1,
         )
 
     def _leap(self) -> int:
