@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from PIL import Image
 
 from terrella.core import make_rng
+from terrella.sim import doom
 from terrella.sim.doom import CAMERA, Doom, DoomConfig
 
 Row = tuple[np.ndarray, np.ndarray, list[float]]  # rgb uint8 [H, W, 3], depth [H, W] in metres (0: none), lens [4]
@@ -18,6 +20,7 @@ GAME = "freedoom2"
 MAPS = tuple(f"MAP{number:02d}" for number in range(1, 33))
 UNSEEN_MAPS = MAPS[4::6]  # kept out of training: MAP05, MAP11, ...
 FARTHEST_M = 59.0
+MOST_EPISODES = 8  # of a map
 
 
 def doom_pictures(maps: Sequence[str], count: int, seed: int) -> Iterator[Row]:
@@ -25,20 +28,15 @@ def doom_pictures(maps: Sequence[str], count: int, seed: int) -> Iterator[Row]:
     rng = np.random.default_rng(seed)
     for number, name in enumerate(maps):
         game = Doom(DoomConfig(f"{GAME}/{name}"))
-        names, each = list(game.buttons), -(-count // len(maps))
-        for part in range(-(-each // 8)):
-            state = game.start(1, make_rng(seed * 1000 + number * 100 + part))
-            for _ in range(min(8, each - 8 * part)):
-                turn, turns, steps = (
-                    str(rng.choice(["TURN_LEFT", "TURN_RIGHT"])),
-                    int(rng.integers(3, 40)),
-                    int(rng.integers(5, 40)),
-                )
+        names, each, made, part = list(game.buttons), -(-count // len(maps)), 0, 0
+        while made < each and part < MOST_EPISODES:
+            state, part = game.start(1, make_rng(seed * 1000 + number * 100 + part)), part + 1
+            for _ in range(min(8, each - made)):
+                turn, turns, steps = _walk(rng)
                 for step in range(turns + steps):
                     held = [turn] if step < turns else ["MOVE_FORWARD"]
-                    state = game.imagine(
-                        state, torch.tensor([[one in held for one in names]], dtype=torch.int8), make_rng(0)
-                    )
+                    buttons = torch.tensor([[one in held for one in names]], dtype=torch.int8)
+                    state = game.imagine(state, buttons, make_rng(0))
                 seen = game.render(state, ("rgb", "depth", "done"))
                 rgb, depth = seen["rgb"][0].numpy(), seen["depth"][0].numpy()
                 if bool(seen["done"][0]):
@@ -47,8 +45,14 @@ def doom_pictures(maps: Sequence[str], count: int, seed: int) -> Iterator[Row]:
                     continue
                 shown = np.asarray(Image.fromarray(rgb).resize(DOOM_SIZE[::-1], Image.Resampling.BOX))
                 rows = ((np.arange(DOOM_SIZE[0]) + 0.5) * depth.shape[0] / DOOM_SIZE[0]).astype(int)
+                made += 1
                 yield shown, np.where(depth < FARTHEST_M, depth, 0)[rows], [CAMERA[0], 0.0, 0.0, np.nan]
         game.close()
+
+
+def _walk(rng: np.random.Generator) -> tuple[str, int, int]:
+    """A button that turns, and how many steps it is held before one goes ahead for how many."""
+    return str(rng.choice(["TURN_LEFT", "TURN_RIGHT"])), int(rng.integers(3, 40)), int(rng.integers(5, 40))
 
 
 def table_model(rng: np.random.Generator) -> str:
@@ -130,9 +134,7 @@ def random_tables(rng: np.random.Generator) -> Iterator[tuple[mujoco.MjModel, fl
 
 def robot_tables() -> Iterator[tuple[mujoco.MjModel, float]]:
     """Terrella's own robots at tables, which training never sees."""
-    from terrella.sim.mujoco_world import MujocoWorld
-
-    for name in ("blocks", "yam", "arm"):
-        model = MujocoWorld(name).model
+    for name in ("blocks", "stack"):
+        model = mujoco.MjModel.from_xml_path(str(Path(doom.__file__).parent / "models" / f"{name}.xml"))
         planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
         yield model, float(model.geom_pos[planes[0], 2])

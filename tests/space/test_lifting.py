@@ -146,6 +146,9 @@ def test_bodies_stop_at_the_box_of_a_picture_and_stand_on_its_floor():
     world = place_of(a_box_before_a_wall(), "box", {})
     places = world.places[world.places[:, 3] > 0]
     assert len(places) > 8 and float(places[:, 0].max()) > 0.7  # from below the camera, where the floor is invented
+    layers = a_box_before_a_wall()
+    drawn = rasterise(world.gaussians, layers.pose[None], layers.camera, (48, 64))  # it does not cover the picture
+    assert float((drawn.rgb[0] - layers.rgb).abs()[:, -6:].mean()) < 0.02
     state = world.start(1, terrella.make_rng(0))
     ahead = torch.zeros(1, 8, dtype=torch.int8)
     ahead[0, 0] = 1

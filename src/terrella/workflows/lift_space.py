@@ -60,7 +60,7 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
 def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
     """The place of a picture's layers, with a walker whose eyes are where its camera was."""
     gaussians, seen = to_gaussians(layers)
-    floor = floor_below(gaussians.at(seen))
+    floor = floor_below(gaussians.at(seen), layers)
     gaussians, seen = join([gaussians, floor]), torch.cat([seen, torch.zeros(len(floor), dtype=torch.bool)])
     height, width = layers.depth.shape
     share = 256 / max(height, width)

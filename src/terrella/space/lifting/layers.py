@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from ..camera import Intrinsics, rays
+from ..camera import Intrinsics, project, rays
 from ..raster import Gaussians, join
 from ..raster.gaussians import plain_sh
 from ..raster.move import quaternion_of
@@ -22,8 +22,9 @@ WINDOW, ALIKE = (
     13,
     0.15,
 )  # pixels of the network's picture, and a difference of logarithms, over which depth is smoothed
+COLOURS = 0.03  # the squared difference of like colours
 EDGE = 0.06  # steps of the logarithm of depth that are edges
-HIDES = 0.35  # the probability from which a hidden surface is made
+HIDES = 0.2  # the probability from which a hidden surface is made
 MIRROR = torch.tensor([1.0, 1.0, -1.0, 1.0])  # the view in a mirror: roll turns the other way
 FLOOR_M, CELL_M = 0.08, 0.06  # how far from 0 the floor may lie; the spacing of Gaussians that continue it
 MOST_TILT = 0.15  # radians
@@ -78,7 +79,7 @@ def layers_of(
     codes = _codes(lifter, seen)
     log_focal, pitch, roll, log_height = (float(part) for part in codes.lens[0])
     focal = focal or math.exp(min(max(log_focal, math.log(0.35)), math.log(1.6)))
-    near = _sharpened(_smoothed(codes.near[0], codes.spread[0]), seen[0], rgb)
+    near = _sharpened(_smoothed(codes.near[0], codes.spread[0], seen[0]), seen[0], rgb)
     spread = F.interpolate(codes.spread[None], (height, width), mode="bilinear")[0, 0]
     half = (-(-height // 2), -(-width // 2))
     step, hides, behind_rgb = (
@@ -137,16 +138,19 @@ def _sharpened(near: torch.Tensor, small: torch.Tensor, rgb: torch.Tensor) -> to
     return plain
 
 
-def _smoothed(near: torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
+def _smoothed(near: torch.Tensor, spread: torch.Tensor, small: torch.Tensor) -> torch.Tensor:
     """Logarithms of depth [h, w] without ripples: at each pixel a plane through its neighbourhood (inverse depth is linear on
-    planes), weighted by how sure and how alike their depths are."""
+    planes), weighted by how sure and how alike their depths are, and by how
+    alike the colours of the picture `small` [3, h, w] are."""
     reach, (height, width) = WINDOW // 2, near.shape
     inverse, sure = (-near).exp(), (-2 * spread.clamp_min(-4)).exp()
     padded = [F.pad(part[None, None], (reach,) * 4, mode="replicate") for part in (inverse, near, sure)]
     value, log, sure = (F.unfold(part, WINDOW)[0] for part in padded)
     offset = torch.arange(WINDOW) - reach
     v, u = (part.reshape(-1, 1).float() for part in torch.meshgrid(offset, offset, indexing="ij"))
-    spot = near.flatten()
+    spot, colours = near.flatten(), F.pad(small[None], (reach,) * 4, mode="replicate")
+    colours = F.unfold(colours, WINDOW)[0].view(3, WINDOW**2, -1)
+    sure = sure * (-(colours - small.flatten(1)[:, None]).square().sum(0) / COLOURS).exp()
     plane = inverse.flatten()
     for _ in range(2):
         weight = sure * (-((log - spot) / ALIKE).square() - (u.square() + v.square()) / (2 * (reach / 1.5) ** 2)).exp()
@@ -216,7 +220,7 @@ def to_gaussians(layers: PictureLayers, two: bool = True) -> tuple[Gaussians, to
     return join([first, more]), torch.arange(len(first) + len(more)) < len(first)
 
 
-def floor_below(seen: Gaussians) -> Gaussians:
+def floor_below(seen: Gaussians, layers: PictureLayers) -> Gaussians:
     """Invented Gaussians of the floor from below the camera, which stands at x = y = 0, to where the picture shows it, in the
     colours of the nearest part that it shows; none where it shows no floor."""
     near = seen.means[:, 2].abs() < FLOOR_M
@@ -229,13 +233,13 @@ def floor_below(seen: Gaussians) -> Gaussians:
     )
     spots = torch.stack([x.flatten(), y.flatten()], 1)
     apart, nearest = torch.cdist(spots, floor.means[:, :2]).min(1)
-    spots, nearest = spots[apart > CELL_M], nearest[apart > CELL_M]
-    level = torch.full((len(spots), 1), float(floor.means[:, 2].median()))
+    spots = torch.cat([spots, torch.full((len(spots), 1), float(floor.means[:, 2].median()))], 1)
+    where, ahead = project(spots, layers.pose, layers.camera)
+    framed = (ahead > 0) & ((where - 0.5).abs() < 0.52).all(1)  # it must not cover the picture
+    spots, nearest = (part[(apart > CELL_M) & ~framed] for part in (spots, nearest))
     count, flat = len(spots), torch.tensor([0.6 * CELL_M, 0.6 * CELL_M, 0.005])
     turn = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
-    return Gaussians(
-        torch.cat([spots, level], 1), turn, flat.expand(count, 3), torch.full((count,), OPACITY), floor.sh[nearest]
-    )
+    return Gaussians(spots, turn, flat.expand(count, 3), torch.full((count,), OPACITY), floor.sh[nearest])
 
 
 def _of_pixels(depth: torch.Tensor, rgb: torch.Tensor, some: torch.Tensor, layers: PictureLayers) -> Gaussians:
