@@ -105,13 +105,15 @@ def test_levels_and_shares_are_those_of_the_recording(learned):
     assert len(many) <= 33 and list(many) == sorted(set(many))
 
 
-def test_rewards_that_vary_all_the_time_are_no_events(learned):
+def test_rewards_and_vitals_that_vary_all_the_time_are_no_events(learned):
     _, _, happened, _ = learned
     rewarded = happened.reward != 0
     assert (happened.events() >= (rewarded & happened.real)).all() and rewarded.any()
     varied = replace(happened, reward=np.random.default_rng(0).random(len(happened.real)).astype(np.float32))
     without = replace(happened, reward=np.zeros_like(happened.reward))
     assert np.array_equal(varied.events(), without.events()) and 0 < varied.events().mean() < 0.5
+    steady = replace(varied, change=np.random.default_rng(1).random(happened.change.shape).astype(np.float32))
+    assert np.array_equal(steady.events(), happened.real & happened.done) and steady.events().any()
 
 
 @pytest.mark.parametrize("followed", [0.0, 1.0])

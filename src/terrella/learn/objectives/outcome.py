@@ -52,11 +52,11 @@ class Happenings:
         return bool(self.names) or bool(np.ptp(self.reward[self.real])) or bool(self.done[self.real].any())
 
     def events(self) -> np.ndarray:
-        """bool [N]: steps with a termination, a change of vitals or, where most rewards are the same, another reward."""
-        unusual = self.reward != np.median(self.reward[self.real])
-        if unusual[self.real].mean() > 0.5:  # rewards vary all the time
-            unusual = np.zeros_like(self.done)
-        return self.real & (unusual | self.done | (self.change != 0).any(1))
+        """bool [N]: steps with a termination, another reward than most, or a change of a vital. Rewards and vitals that vary most
+        of the time are no events."""
+        unusual = np.column_stack([self.reward != np.median(self.reward[self.real]), self.change != 0])
+        rare = unusual[self.real].mean(0) <= 0.5
+        return self.real & (self.done | unusual[:, rare].any(1))
 
     def config(self, cameras: int = 1) -> OutcomeConfig:
         """Of frames in which the pictures of this many cameras lie side by side."""
