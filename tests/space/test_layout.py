@@ -136,7 +136,9 @@ def test_what_is_built_is_whole_and_lit():
     grey = seen.rgb.mean((0, 1))
     assert 0.3 < grey.mean() < 0.8 and grey.std() > 0.05
     low, high = (torch.tensor(v) for v in (heard.layout.rooms[0].low, heard.layout.rooms[0].high))
-    assert ((place.gaussians.means > low - 0.2) & (place.gaussians.means < high + 0.2)).all()
+    within = ((place.gaussians.means > low - 0.2) & (place.gaussians.means < high + 0.2)).all(1)
+    windows = torch.tensor([number for number, name in enumerate(place.names, 1) if name == "window"])
+    assert torch.isin(place.objects[~within], windows).all() and not within.all()  # the view outside
 
 
 def kinds(text: str) -> tuple[Counter, tuple[str, ...]]:
@@ -227,3 +229,35 @@ def test_plain_walls_show_no_weave():
     grey = rasterise(place.gaussians, pose, (0.5, 0.5, 0.5, 0.5), (200, 200)).rgb.mean(1, keepdim=True)
     fine = (grey - torch.nn.functional.avg_pool2d(grey, 15, 1, 7))[..., 40:-40, 40:-40]
     assert 0.3 < grey.mean() < 0.95 and fine.std() < 0.0016  # a regular grid of equal Gaussians: 0.0021
+
+
+def test_styles_and_times_are_understood_and_change_the_picture():
+    plain, dressed = parse_text("a kitchen"), parse_text("a bright scandinavian kitchen at noon")
+    assert dressed.unknown == () and (dressed.layout.style, dressed.layout.time) == ("scandinavian", "noon")
+    assert not plain.layout.things and {"counter", "table", "chair"} <= {thing.label for thing in dressed.layout.things}
+    for text in (
+        "a dungeon with torches",
+        "a japanese tea room in the evening",
+        "a concrete loft with big windows at sunset",
+    ):
+        assert parse_text(text).unknown == () and parse_text(text).layout.things
+    assert not parse_text("an empty japanese tea room").layout.things
+    shown = []
+    for time in ("noon", "sunset", "night"):
+        place = build(
+            read_layout({"rooms": [ROOM], "windows": [{"room": "hall", "wall": "south"}], "time": time}), 4000
+        )
+        shown.append(place.gaussians.colours[place.objects == 0].mean(0))
+    assert shown[0].mean() > 1.3 * shown[2].mean() and shown[1][0] / shown[1][2] > 1.1 * shown[0][0] / shown[0][2]
+
+
+def test_the_floor_is_darker_at_the_foot_of_a_table():
+    place = build(
+        read_layout({"rooms": [{**ROOM, "floor": "white paint"}], "things": [{"label": "wardrobe", "at": [3, 2]}]}),
+        20_000,
+    )
+    means, grey = place.gaussians.means, place.gaussians.colours.mean(1)
+    floor = (means[:, 2].abs() < 0.01) & (place.objects == 0) & ((means[:, 0] - 3).abs() < 0.4)
+    behind = means[:, 1] - 2.3  # metres
+    foot, away = (floor & (behind > a) & (behind < b) for a, b in ((0.0, 0.06), (0.6, 0.9)))
+    assert foot.any() and grey[foot].mean() < 0.85 * grey[away].mean()

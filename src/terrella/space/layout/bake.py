@@ -10,20 +10,24 @@ from ..camera import planar_pose
 from ..edits import REVEALED
 from ..kernels_numba import light as kernels
 from ..raster import Gaussians
+from ..raster.gaussians import join
 from ..views import over_views
 from .blocks import Blocks, blocks_of
 from .cells import cells_of, gaussians_of
 from .daylight import daylight_of
+from .extras import flame, foliage, leaves_in, outside
 from .grids import AXES, Grid, grid
 from .light import CONTACT_M, TEXEL_M, LitBoxes, contact, filmed, light_map, sampled
 from .room_layout import RoomLayout
 from .shapes import bend, numbers
+from .styles import style_of
 from .textures import texture_colours
 
 OPACITY = REVEALED
 PER_CELL = 11  # texels of the fine picture for each Gaussian
 THINGS_M, FINEST_M = 0.65, 0.004  # spacing on things relative to the building; the finest
 HIDDEN = 0.4  # contrast of what lies beneath things
+BEYOND_M = (0.01, 0.07)  # metres past an edge at which there may be air
 _SURE = 0.004  # metres in front of a surface that must be free
 
 
@@ -54,17 +58,21 @@ def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
     light = light_map(scene, texels, bare, len(plan.rooms), plan.seed)
     used = np.zeros(6 * len(boxes), np.bool_)
     used[texels.faces[kinds > 0]] = True
+    drawn = np.array([look.material != "glass" and shape.drawn for look, shape in zip(blocks.looks, blocks.shapes)])
+    used &= np.repeat(drawn, 6)
     close = contact(scene, used, _coarse(plan, CONTACT_M))
     fine = _fine(boxes, objects, texels, kinds, used, count)
     kinds = _kinds(fine, blocks, bodies)
-    picture = _picture(plan, blocks, scene, shapes, fine, kinds, (texels, light), close)
-    cells = cells_of(fine, picture, kinds, _edges(fine, kinds, boxes), _weights(blocks, objects), count)
+    picture, exposure = _picture(plan, blocks, scene, shapes, fine, kinds, (texels, light), close)
+    edges = _edges(fine, kinds, _opaque(blocks), shapes)
+    cells = cells_of(fine, picture, kinds, edges, (_weights(blocks, objects), _round(boxes, shapes)), count)
     owner = objects[cells.faces // 6]
     owner = np.where(cells.kinds > 1, 1 - cells.kinds, owner).astype(np.int32)
-    gaussians = gaussians_of(cells, boxes, shapes, OPACITY * (owner >= 0))
+    parts = [(gaussians_of(cells, boxes, shapes, OPACITY * (owner >= 0)), owner)]
+    parts += _extras(plan, blocks, scene, (texels, light), exposure)
     return BuiltPlace(
-        gaussians,
-        torch.from_numpy(owner),
+        join([part for part, _ in parts]),
+        torch.from_numpy(np.concatenate([whose for _, whose in parts])),
         tuple(blocks.names),
         torch.from_numpy(blocks.solids),
         torch.from_numpy(bodies[np.asarray(blocks.solid)]),
@@ -86,9 +94,38 @@ def _kinds(cells: Grid, blocks: Blocks, bodies: np.ndarray) -> np.ndarray:
     for number in set(objects[bodies > 0]):
         fixed[objects == number] = False
     kind, fronts = np.empty(len(cells.points), np.int32), cells.points + _SURE * cells.normals
-    given = fronts, cells.blocks, blocks.boxes, objects, fixed, air, kind
+    given = fronts, cells.blocks, _opaque(blocks), objects, fixed, air, kind
     over_views(len(kind), lambda first, last: kernels.kinds(first, last, *given))
     return kind
+
+
+def _opaque(blocks: Blocks) -> np.ndarray:
+    """The boxes [K, 6] that hide what lies in them; leaves and flames lie far away."""
+    boxes = blocks.boxes
+    boxes[[not shape.drawn for shape in blocks.shapes]] = 1e6
+    return boxes
+
+
+def _extras(plan, blocks: Blocks, scene: LitBoxes, lit: tuple[Grid, np.ndarray], exposure: float):
+    """Leaves, flames and views from windows, each with its objects."""
+    parts, boxes = [], scene.boxes
+    for k, shape in enumerate(blocks.shapes):
+        low, high = boxes[k, :3], boxes[k, 3:]
+        if shape.drawn:
+            continue
+        if blocks.looks[k].material == "flame":
+            part = flame(low, high)
+        else:
+            leaves = leaves_in(low, high, plan.seed + k)
+            places, turns, _ = leaves
+            normals = turns[:, :, 2] * np.where(turns[:, 2:, 2] < 0, -1.0, 1.0)
+            falls = sampled(*lit, boxes, places, normals, np.full(len(places), k))
+            tone = np.random.default_rng(plan.seed + k).uniform(0.65, 1.3, (len(places), 1))
+            part = foliage(leaves, filmed(np.clip(np.array(blocks.looks[k].colour) * tone, 0, 1), falls, exposure))
+        parts.append((part, np.full(len(part), blocks.objects[k], np.int32)))
+    for number, part in enumerate(outside(plan, style_of(plan.style).outside, scene.daylight), len(plan.doors) + 1):
+        parts.append((part, np.full(len(part), number, np.int32)))
+    return parts
 
 
 def _fine(boxes, objects, texels: Grid, kinds: np.ndarray, used: np.ndarray, count: int) -> Grid:
@@ -99,10 +136,10 @@ def _fine(boxes, objects, texels: Grid, kinds: np.ndarray, used: np.ndarray, cou
     return grid(boxes, np.maximum(spacing, FINEST_M), used)
 
 
-def _picture(plan, blocks, scene, shapes, fine, kinds, lit, close) -> np.ndarray:
-    """Colours [M, 3] of the cells of a fine grid as a camera shows them."""
+def _picture(plan, blocks, scene, shapes, fine, kinds, lit, close) -> tuple[np.ndarray, float]:
+    """Colours [M, 3] of the cells of a fine grid as a camera shows them, and its exposure."""
     own = _own(plan, blocks, scene.boxes, fine)
-    points, normals = fine.points, fine.normals
+    points, normals = fine.points.copy(), fine.normals
     bent = np.flatnonzero((shapes > 0)[:, [0, 1, 4]].any(1)[fine.blocks])
     points[bent], normals[bent] = bend(
         points[bent], fine.sides[bent], scene.boxes[fine.blocks[bent]], shapes[fine.blocks[bent]]
@@ -121,7 +158,8 @@ def _picture(plan, blocks, scene, shapes, fine, kinds, lit, close) -> np.ndarray
     middle = (
         math.exp((np.log(np.maximum(falls[seen].mean(1), 1e-4)) * weight).sum() / weight.sum()) if seen.any() else 1.0
     )
-    shown = filmed(own, falls, scene.daylight.exposure / middle)
+    exposure = scene.daylight.exposure / middle
+    shown = filmed(own, falls, exposure)
     shown[glows] = own[glows]
     hidden = kinds > 1
     if hidden.any():
@@ -132,7 +170,7 @@ def _picture(plan, blocks, scene, shapes, fine, kinds, lit, close) -> np.ndarray
             / many[:, None]
         )
         shown[hidden] = mean[faces[hidden]] + HIDDEN * (shown[hidden] - mean[faces[hidden]])
-    return shown
+    return shown, exposure
 
 
 def _own(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, fine: Grid) -> np.ndarray:
@@ -162,8 +200,9 @@ def _own(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, fine: Grid) -> np.
     return own
 
 
-def _edges(fine: Grid, kinds: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Where cells lie at an edge beyond which there is air: uint8 [M], bits 1, 2, 4, 8 for the low and high row and column."""
+def _edges(fine: Grid, kinds: np.ndarray, boxes: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Where cells lie at an edge with air beyond it, at once or after something thin: uint8 [M], bits 1, 2, 4, 8 for the
+    low and high row and column."""
     edges = np.zeros(len(kinds), np.uint8)
     rows = np.arange(len(kinds)) - fine.starts[fine.faces]
     across = fine.counts[fine.faces, 1]
@@ -172,14 +211,25 @@ def _edges(fine: Grid, kinds: np.ndarray, boxes: np.ndarray) -> np.ndarray:
         along = AXES[fine.sides // 2, axis]
         for high in (0, 1):
             ends = np.flatnonzero((place[:, axis] == high * (fine.counts[fine.faces, axis] - 1)) & (kinds == 1))
-            beyond = fine.points[ends] - _SURE * fine.normals[ends]
-            beyond[np.arange(len(ends)), along[ends]] += (2 * high - 1) * (
-                fine.steps[fine.faces[ends], axis] / 2 + 0.01
-            )
-            inside = np.empty(len(ends), np.bool_)
-            kernels.in_any(0, len(ends), beyond, boxes, 0.0, inside)
-            edges[ends[~inside]] |= 1 << (2 * axis + high)
+            kind = shapes[fine.blocks[ends]]
+            ends = ends[
+                (kind[:, 4] == 0) & ((kind[:, 1] == 0) | (fine.sides[ends] > 3) | (along[ends] == 2))
+            ]  # others are round
+            for off in BEYOND_M:
+                beyond = fine.points[ends] - _SURE * fine.normals[ends]
+                step = fine.steps[fine.faces[ends], axis] / 2
+                beyond[np.arange(len(ends)), along[ends]] += (2 * high - 1) * (step + off)
+                inside = np.empty(len(ends), np.bool_)
+                kernels.in_any(0, len(ends), beyond, boxes, 0.0, inside)
+                edges[ends[~inside]] |= 1 << (2 * axis + high)
     return edges
+
+
+def _round(boxes: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """The longest cell on each block that is so round that longer ones would stand out from it [K], metres."""
+    half = (boxes[:, 3:] - boxes[:, :3]) / 2
+    tube = np.where(shapes[:, 1] > 0, 0.5 * half[:, :2].min(1), np.inf)
+    return np.maximum(np.minimum(tube, np.where(shapes[:, 4] > 0, 0.55 * half.min(1), np.inf)), 0.012)
 
 
 def _weights(blocks: Blocks, objects: np.ndarray) -> np.ndarray:

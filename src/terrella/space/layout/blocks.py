@@ -10,11 +10,13 @@ from ...core.errors import ContractError
 from .furniture import kind_of
 from .looks import Look, look_of
 from .room_layout import REACH_M, WALL_M, WALLS, Door, Room, RoomLayout, Stairs, Thing, Window, room_at
-from .shapes import SHARP, Shape
+from .shapes import SHAPES, SHARP, Shape
+from .styles import Style, style_of, styled
 
 RISER_M = 0.18  # largest height of a step
 FRAME_M = 0.05
 _LEAF_M = 0.04
+SKIRTING_M = (0.012, 0.09)  # its depth and height
 INSIDE_M = 2e-3  # an object that overlaps another by more cannot be pushed
 LEVEL_M = 0.35  # largest difference of the floors that a door joins
 _TURNS = {"south": 0, "east": 1, "north": 2, "west": 3}  # quarter turns to the left
@@ -90,7 +92,7 @@ def blocks_of(plan: RoomLayout) -> Blocks:
     for window in plan.windows:
         _window(blocks, plan, window, holes)
     for room in plan.rooms:
-        _room(blocks, room, holes, any(one.room == room.name for one in plan.windows))
+        _room(blocks, room, holes, any(one.room == room.name for one in plan.windows), style_of(plan.style))
     for stairs in plan.stairs:
         _stairs(blocks, plan, stairs)
     for thing in plan.things:
@@ -116,7 +118,7 @@ class _Wall:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
 
-def _room(blocks: Blocks, room: Room, holes: dict, bright: bool) -> None:
+def _room(blocks: Blocks, room: Room, holes: dict, bright: bool, style: Style) -> None:
     (x0, y0, z0), (x1, y1, z1) = room.low, room.high
     w = WALL_M
     blocks.air.append((room.low, room.high))
@@ -129,6 +131,10 @@ def _room(blocks: Blocks, room: Room, holes: dict, bright: bool) -> None:
             rects = [part for rect in rects for part in _without(rect, hole)]
         for a0, a1, low, high in rects:
             blocks.add(*wall.box((a0, a1), (0, w), (low, high)), look_of(room.walls))
+            if style.skirting and low == z0 and look_of(room.ceiling).material != "sky":
+                ends = max(a0, wall.origin), min(a1, wall.origin + wall.length)
+                foot = wall.box(ends, (-SKIRTING_M[0], 0), (z0, z0 + SKIRTING_M[1]))
+                blocks.add(*foot, look_of(style.paint), solid=False)
     lamps = room.lamps
     if look_of(room.ceiling).material == "sky":
         lamps = lamps or 0
@@ -163,10 +169,11 @@ def _without(rect: tuple[float, ...], hole: tuple[float, ...]) -> list[tuple[flo
 
 def _door(blocks: Blocks, plan: RoomLayout, door: Door, holes: dict) -> None:
     room = next(one for one in plan.rooms if one.name == door.room)
-    wall, look, thing = _Wall(room, door.wall), look_of(door.look, "wood"), blocks.named("door")
+    style, wall, thing = style_of(plan.style), _Wall(room, door.wall), blocks.named("door")
+    look = look_of(styled(door.look, style), "wood")
     middle = wall.origin + (wall.length / 2 if door.at is None else door.at)
     a0, a1, z0 = middle - door.width / 2, middle + door.width / 2, room.at[2]
-    top, white = z0 + door.height, look_of("white paint")
+    top, white = z0 + door.height, look_of(style.paint)
     beyond, gap = _beyond(plan, room, door, wall, (a0, a1))
     f = FRAME_M
     if beyond is None:
@@ -174,8 +181,8 @@ def _door(blocks: Blocks, plan: RoomLayout, door: Door, holes: dict) -> None:
         for panel in ((0.12, 0.46), (0.54, 0.93)):
             low, high = (z0 + share * door.height for share in panel)
             blocks.add(*wall.box((a0 + 0.14, a1 - 0.14), (-_LEAF_M - 0.012, -_LEAF_M), (low, high)), look, thing)
-        knob = wall.box((a1 - 0.13, a1 - 0.06), (-_LEAF_M - 0.05, -_LEAF_M), (z0 + 1.0, z0 + 1.05))
-        blocks.add(*knob, look_of("golden metal"), thing, False)
+        knob = wall.box((a1 - 0.13, a1 - 0.07), (-_LEAF_M - 0.055, -_LEAF_M), (z0 + 1.0, z0 + 1.06))
+        blocks.add(*knob, look_of("golden metal"), thing, False, SHAPES["ball"])
         for span in ((a0 - f, a0), (a1, a1 + f)):
             blocks.add(*wall.box(span, (-_LEAF_M - 0.02, 0), (z0, top)), white)
         blocks.add(*wall.box((a0 - f, a1 + f), (-_LEAF_M - 0.02, 0), (top, top + f)), white)
@@ -191,6 +198,10 @@ def _door(blocks: Blocks, plan: RoomLayout, door: Door, holes: dict) -> None:
     blocks.add(*wall.box((a0 + f, a1 - f), (-0.015, gap + 0.015), (top - f, top)), white)
     leaf = (a0 + f, a0 + f + _LEAF_M), (-0.015 - (door.width - 2 * f), -0.015), (z0, top - f)
     blocks.add(*wall.box(*leaf), look, thing)
+    for side in (-0.05, _LEAF_M):
+        at = a0 + f + side, a0 + f + side + 0.05
+        knob = wall.box(at, (-door.width + 2 * f + 0.03, -door.width + 2 * f + 0.09), (z0 + 1.0, z0 + 1.06))
+        blocks.add(*knob, look_of("golden metal"), thing, False, SHAPES["ball"])
 
 
 def _beyond(
@@ -216,7 +227,8 @@ def _beyond(
 
 def _window(blocks: Blocks, plan: RoomLayout, window: Window, holes: dict) -> None:
     room = next(one for one in plan.rooms if one.name == window.room)
-    wall, look, thing = _Wall(room, window.wall), look_of(window.look), blocks.named("window")
+    style, wall, thing = style_of(plan.style), _Wall(room, window.wall), blocks.named("window")
+    look = look_of(styled(window.look, style))
     middle = wall.origin + (wall.length / 2 if window.at is None else window.at)
     a0, a1 = middle - window.width / 2, middle + window.width / 2
     z0 = room.at[2] + window.sill
@@ -232,8 +244,29 @@ def _window(blocks: Blocks, plan: RoomLayout, window: Window, holes: dict) -> No
     for low in (z0, z1 - f):
         blocks.add(*wall.box((a0 + f, a1 - f), depth, (low, low + f)), look, thing)
     bar = (WALL_M - 0.06, WALL_M - 0.03)
-    blocks.add(*wall.box((middle - 0.02, middle + 0.02), bar, (z0 + f, z1 - f)), look, thing)
+    across, up = (max(round(one), 1) for one in style.panes)
+    for k in range(1, across):
+        at = a0 + f + (a1 - a0 - 2 * f) * k / across
+        blocks.add(*wall.box((at - 0.015, at + 0.015), bar, (z0 + f, z1 - f)), look, thing)
+    for k in range(1, up):
+        at = z0 + f + (z1 - z0 - 2 * f) * k / up
+        blocks.add(*wall.box((a0 + f, a1 - f), bar, (at - 0.015, at + 0.015)), look, thing)
+    if style.curtains:
+        _curtains(blocks, wall, (a0, a1, max(z0 - 0.25, room.at[2] + 0.02), z1 + 0.1), style, thing)
     blocks.add(*wall.box((a0 - 0.06, a1 + 0.06), (-0.12, 0), (z0 - 0.04, z0)), look, thing)
+
+
+def _curtains(blocks: Blocks, wall: _Wall, rect: tuple[float, ...], style: Style, thing: int) -> None:
+    """A rod and two gathered curtains beside a window."""
+    a0, a1, low, high = rect
+    ends = max(a0 - 0.3, wall.origin + 0.02), min(a1 + 0.3, wall.origin + wall.length - 0.02)
+    blocks.add(*wall.box(ends, (-0.125, -0.1), (high, high + 0.025)), look_of(style.metal), thing, False, SHAPES["box"])
+    for first, last in ((ends[0] + 0.02, a0 + 0.1), (a1 - 0.1, ends[1] - 0.02)):
+        folds = max(round((last - first) / 0.075), 1)
+        for k in range(folds):
+            span = first + (last - first) * (k - 0.12) / folds, first + (last - first) * (k + 1.12) / folds
+            deep = (-0.15 - 0.015 * (k % 2), -0.075)
+            blocks.add(*wall.box(span, deep, (low, high)), look_of(style.curtains), thing, False, SHAPES["tube"])
 
 
 def _stairs(blocks: Blocks, plan: RoomLayout, stairs: Stairs) -> None:
@@ -267,19 +300,21 @@ def _thing(blocks: Blocks, plan: RoomLayout, thing: Thing) -> None:
     _inside(plan, low, high, thing.label)
     if kind.movable if thing.movable is None else thing.movable:
         blocks.movable.add(number)
-    own = look_of(thing.look, look_of(kind.look).material) if thing.look else look_of(kind.look)
-    for x0, y0, z0, x1, y1, z1, words in kind.parts:
-        corners = [((x - 0.5) * width, (y - 0.5) * depth) for x, y in ((x0, y0), (x1, y1))]
+    style = style_of(plan.style)
+    own = look_of(thing.look, look_of(kind.look).material) if thing.look else look_of(styled(kind.look, style))
+    for part in kind.parts:
+        corners = [((x - 0.5) * width, (y - 0.5) * depth) for x, y in ((part.x0, part.y0), (part.x1, part.y1))]
         for _ in range(turns):
             corners = [(-y, x) for x, y in corners]
         (ax, ay), (bx, by) = corners
         at = thing.at
         blocks.add(
-            (at[0] + min(ax, bx), at[1] + min(ay, by), at[2] + z0 * height),
-            (at[0] + max(ax, bx), at[1] + max(ay, by), at[2] + z1 * height),
-            look_of(words) if words else own,
+            (at[0] + min(ax, bx), at[1] + min(ay, by), at[2] + part.z0 * height),
+            (at[0] + max(ax, bx), at[1] + max(ay, by), at[2] + part.z1 * height),
+            look_of(styled(part.look, style)) if part.look else own,
             number,
-            not kind.soft,
+            part.solid and not kind.soft,
+            SHAPES[part.shape],
         )
 
 

@@ -36,13 +36,19 @@ class Cells:
 
 
 def cells_of(
-    fine: Grid, picture: np.ndarray, kinds: np.ndarray, edges: np.ndarray, weights: np.ndarray, count: int
+    fine: Grid,
+    picture: np.ndarray,
+    kinds: np.ndarray,
+    edges: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+    count: int,
 ) -> Cells:
-    """About `count` cells of a picture [M, 3] on a fine grid, with kinds [M] (0: nothing there) and edges [M]; weights [F]
-    of the sides' errors."""
+    """About `count` cells of a picture [M, 3] on a fine grid, with kinds [M] (0: nothing there) and edges [M]; limits: weights [F]
+    of the sides' errors, and the longest cell of each block [K] in metres."""
+    weights, most = limits
     faces = np.flatnonzero(fine.counts[:, 0] > 0)
     area = float(fine.areas[kinds > 0].sum())
-    longest = np.full(len(faces), max(LONGEST_M, 2.2 * (area / count) ** 0.5))
+    longest = np.minimum(max(LONGEST_M, 2.2 * (area / count) ** 0.5), most[faces // 6])
     starts, counts, steps = fine.starts[faces], fine.counts[faces], fine.steps[faces]
     picture, kinds = np.ascontiguousarray(picture, np.float32), kinds.astype(np.int32)
     rows = kernels.cut(starts, counts, steps, longest, weights[faces], picture, kinds, int(count * (1 - GRADING)))

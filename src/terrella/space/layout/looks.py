@@ -15,13 +15,13 @@ MATERIALS = {  # each with its default colour
     "stone": "9b968c", "concrete": "a3a19b", "marble": "e4e0da", "carpet": "7c6a72", "cloth": "6d7f8e", "metal": "8f949a",
     "leaves": "4c7a3c", "grass": "5f8a3d", "books": "8a6a4a", "glass": "dfeaf2", "sky": "bcd6f2", "lamp": "ffe9c4",
     "boards": "a5825c", "checker": "dcd8ce", "subway": "eceae4", "flagstone": "8b857a", "tatami": "c6bf86", "paper": "f6efdd",
-    "art": "d9cfb8", "shade": "ffdca8", "flame": "ffb24d", "bulb": "fff0d2",
+    "rug": "8f3a2f", "art": "d9cfb8", "shade": "ffdca8", "flame": "ffc27a", "bulb": "fff0d2",
 }  # fmt: skip
 GLOWING = {"glass": 1.0, "sky": 0.7, "lamp": 16.0, "shade": 14.0, "bulb": 60.0, "flame": 110.0}  # light sources
-_SHADES = {"dark": 0.5, "light": 1.6, "pale": 2.2, "bright": 1.2}
+SHADES = {"dark": 0.5, "light": 1.6, "pale": 2.2, "bright": 1.2}
 _SAME = {"wooden": "wood", "tiled": "tiles", "bricks": "brick", "parquet": "planks", "steel": "metal", "fabric": "cloth",
          "painted": "paint", "tile": "tiles", "plank": "planks", "carpeted": "carpet", "window": "glass"}  # fmt: skip
-WORDS = {*COLOURS, *MATERIALS, *_SHADES, *_SAME}
+WORDS = {*COLOURS, *MATERIALS, *SHADES, *_SAME}
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ def look_of(words: str, usual: str = "paint") -> Look:
             material = word
         elif word in COLOURS:
             colour = COLOURS[word]
-        elif word in _SHADES:
-            shade *= _SHADES[word]
+        elif word in SHADES:
+            shade *= SHADES[word]
         elif re.fullmatch("#[0-9a-f]{6}", word):
             colour = word[1:]
         else:

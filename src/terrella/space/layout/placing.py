@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from .furniture import kind_of
+from .room_layout import MOST_THINGS
 
 _SIDES = ("north", "south", "east", "west")
 _FRONT = {"north": "south", "south": "north", "east": "west", "west": "east"}  # who stands at a wall looks away from it
@@ -71,13 +72,16 @@ class _Room:
         else:
             self.clear.append((self.x0, middle - 0.5, self.x0 + 1.4, middle + 0.5))  # where one begins
         lost = self._openings([one for one in requests if one.label in ("door", "window")], entered, following)
-        order = {"stairs": 0, "pillar": 1, "middle": 2, "wall": 3, "corner": 4, "hung": 5, "any": 6}
+        order = {"stairs": 0, "pillar": 1, "middle": 2, "wall": 3, "corner": 4, "hung": 5, "any": 6, "ceiling": 7}
         rest = [one for one in requests if one.label not in ("door", "window")]
         rest.sort(
             key=lambda one: order.get(one.label, order[kind_of(one.label).stands if one.label != "stairs" else "wall"])
         )
         for one in rest:
-            done = self._place(one)
+            space = MOST_THINGS - len(self.layout["things"]) - len(self.layout["stairs"])
+            done = self._place(
+                replace(one, count=min(one.count, max(space // 2 if one.label == "stairs" else space, 0)))
+            )
             if done < one.count:
                 lost.append((one.label, one.count - done))
         return lost
@@ -166,7 +170,11 @@ class _Room:
         size = tuple(round(a * b, 3) for a, b in zip(kind.size, scale))
         height = min(size[2], self.height - (1.35 if kind.stands == "hung" else 0))
         size = (size[0], size[1], round(height, 3))
-        spots = self._row(one.count, size) if one.label in ("pillar", "rug", "table") and not one.side else []
+        if kind.stands == "ceiling":
+            return self._hang(one, kind, size)
+        spots = (
+            self._row(one.count, size) if one.label in ("pillar", "rug", "table", "lowtable") and not one.side else []
+        )
         for k in range(one.count):
             ways = [*spots[k : k + 1], *self._spots(one, kind.stands, size)]
             for margin in (APART_M, 0.25, 0.02):
@@ -181,16 +189,37 @@ class _Room:
             done += 1
         return done
 
-    def _put(self, one: FurnitureRequest, kind, size, spot: tuple[float, float, str]) -> None:
+    def _hang(self, one: FurnitureRequest, kind, size) -> int:
+        """Hangs lamps from the ceiling: over tables first, then in a row along the room."""
+        over = [((rect[0] + rect[2]) / 2, (rect[1] + rect[3]) / 2) for rect, _ in self.tables]
+        spots = over[: one.count] if one.count <= len(over) else [(x, y) for x, y, _ in self._row(one.count, (1, 1, 1))]
+        if len(over) == 1 and one.count == 2 and one.label == "pendant":
+            (x0, y0, x1, y1), long = self.tables[0][0], 0
+            long = int(y1 - y0 > x1 - x0)
+            spots = [
+                (over[0][0] + (0.4 * way if not long else 0), over[0][1] + (0.4 * way if long else 0))
+                for way in (-1, 1)
+            ]
+        low = max(self.height - size[2], 1.5 if over else 1.75)
+        hung = [
+            (x, y, "south")
+            for x, y in spots
+            if low < self.height - 0.2 and self._inside(self._rect((x, y, "south"), size))
+        ]
+        for spot in hung:
+            self._put(one, kind, (size[0], size[1], round(self.height - low, 3)), spot, round(low, 3))
+        return len(hung)
+
+    def _put(self, one: FurnitureRequest, kind, size, spot: tuple[float, float, str], z: float = 0.0) -> None:
         x, y, facing = spot
-        z = 1.25 if kind.stands == "hung" else 0.0
+        z = kind.hangs_m if kind.stands == "hung" else z
         look = {"look": one.look} if one.look else {}
         entry = {"label": one.label, "at": [round(x, 3), round(y, 3), z], "size": list(size), "facing": facing, **look}
         self.layout["things"].append(entry)
         rect = self._rect(spot, size)
         if not kind.soft:
             self.taken.append(rect)
-        if one.label in ("table", "desk"):
+        if one.label in ("table", "desk", "lowtable"):
             self.tables.append((rect, self._seats(rect, one.label, facing)))
 
     def _rect(self, spot: tuple[float, float, str], size) -> Rect:
@@ -198,17 +227,18 @@ class _Room:
         w, d = (size[1], size[0]) if facing in ("east", "west") else size[:2]
         return (x - w / 2, y - d / 2, x + w / 2, y + d / 2)
 
+    def _inside(self, rect: Rect) -> bool:
+        low, high = (self.x0 - 1e-6, self.y0 - 1e-6), (self.x1 + 1e-6, self.y1 + 1e-6)
+        return rect[0] >= low[0] and rect[1] >= low[1] and rect[2] <= high[0] and rect[3] <= high[1]
+
     def _free(self, rect: Rect, margin: float, soft: bool, label: str) -> bool:
-        inside = (
-            rect[0] >= self.x0 - 1e-6
-            and rect[1] >= self.y0 - 1e-6
-            and rect[2] <= self.x1 + 1e-6
-            and rect[3] <= self.y1 + 1e-6
-        )
+        inside = self._inside(rect)
         if soft or not inside:
             return inside
-        margin = 0.02 if label in ("chair", "pillar") else margin
-        under = [one for one, _ in self.tables] if label == "chair" else []  # chairs stand half under tables
+        margin = 0.02 if label in ("chair", "pillar", "cushion") else margin
+        under = (
+            [one for one, _ in self.tables] if label in ("chair", "cushion") else []
+        )  # chairs stand half under tables
         return not any(_meet(rect, other, margin) for other in self.taken if other not in under) and not any(
             _meet(rect, other, 0.0) for other in self.clear
         )
@@ -226,7 +256,7 @@ class _Room:
 
     def _spots(self, one: FurnitureRequest, stands: str, size) -> Iterator[tuple[float, float, str]]:
         """Candidate positions of a thing, the best first."""
-        if one.label == "chair":
+        if one.label in ("chair", "cushion"):
             for _, seats in self.tables:
                 yield from list(seats)
         if one.side == "middle":

@@ -13,6 +13,7 @@ from typing import Any
 from ...core.errors import ContractError
 from .daylight import daylight_of
 from .looks import look_of
+from .styles import style_of
 
 WALL_M = 0.1
 REACH_M = 0.5  # a door leads to a room at most this far behind its wall
@@ -101,6 +102,7 @@ class RoomLayout:
     start: tuple[float, float, float] | None = None  # x, y and heading in degrees (0 east, 90 north)
     name: str = ""  # default: the file's
     seed: int = 0
+    style: str = "plain"  # of furniture, windows and frames (styles.py)
     time: str = "day"  # of the day (daylight.py)
     sun: tuple[float, float] | None = (
         None  # its heading and its height above the horizon, degrees; default: by the time
@@ -181,6 +183,7 @@ def _value(value: Any, kind: str, where: str) -> Any:
 def check(plan: RoomLayout) -> None:
     """ContractError for a layout that cannot be built."""
     daylight_of(plan.time)
+    style_of(plan.style)
     if not plan.rooms:
         raise ContractError("a layout has at least one room.")
     names = [room.name for room in plan.rooms]

@@ -13,6 +13,7 @@ class Shape:
     tube: bool = False  # a circle or an ellipse from above
     foot: float = 1.0  # width at the foot of a tube, relative to the box
     top: float = 1.0  # and at its top
+    drawn: bool = True  # as a surface; leaves and flames are not
     power: float = 0.0  # a superellipsoid of this exponent; 2: an ellipsoid
 
 
@@ -21,7 +22,7 @@ SHAPES = {
     "box": Shape(radius_m=0.01), "sharp": SHARP, "round": Shape(radius_m=0.03), "soft": Shape(radius_m=0.09),
     "tube": Shape(tube=True), "shade": Shape(tube=True, top=0.62), "pot": Shape(tube=True, foot=0.68),
     "leg": Shape(tube=True, foot=0.6), "bowl": Shape(tube=True, foot=0.45), "ball": Shape(power=2.0),
-    "pillow": Shape(power=2.8), "pad": Shape(power=5.0),
+    "pillow": Shape(power=2.8), "leaves": Shape(drawn=False), "flame": Shape(drawn=False),
 }  # fmt: skip
 
 

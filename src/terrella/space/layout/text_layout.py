@@ -11,9 +11,11 @@ from typing import Any
 
 from ...core.errors import ContractError
 from . import looks
+from .daylight import SAME_TIME, TIMES
 from .furniture import KINDS, SAME
 from .placing import FurnitureRequest, furnish_room
-from .room_layout import RoomLayout, read_layout
+from .room_layout import MOST_THINGS, RoomLayout, read_layout
+from .styles import ALWAYS, EMPTY, MOODS, STYLE_WORDS, STYLES, furnishing
 
 ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in metres, and looks
     "room": {"size": (6.0, 4.8, 2.8)},
@@ -26,6 +28,10 @@ ROOMS: dict[str, dict[str, Any]] = {  # width (to the east), depth and height in
     "library": {"size": (7.0, 5.5, 3.4), "floor": "dark planks", "walls": "cream paint"},
     "gallery": {"size": (9.0, 4.5, 3.4), "floor": "light planks", "walls": "white paint"},
     "cellar": {"size": (6.0, 5.0, 2.5), "floor": "concrete", "walls": "brick", "ceiling": "concrete"},
+    "dungeon": {"size": (7.0, 5.4, 3.0), "floor": "flagstone", "walls": "stone", "ceiling": "dark stone", "lamps": 0},
+    "loft": {"size": (8.5, 6.0, 3.8), "floor": "concrete"},
+    "tearoom": {"size": (5.4, 4.6, 2.6)},
+    "livingroom": {"size": (6.0, 4.8, 2.8)},
     "garage": {"size": (6.5, 5.5, 2.8), "floor": "concrete", "walls": "concrete", "ceiling": "concrete"},
     "courtyard": {"size": (9.0, 8.0, 4.5), "floor": "stone", "walls": "brick", "ceiling": "sky"},
     "garden": {"size": (11.0, 9.0, 4.5), "floor": "grass", "walls": "stone", "ceiling": "sky"},
@@ -72,6 +78,7 @@ class _RoomText:
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     looks: dict[str, str] = field(default_factory=dict)
     things: list[FurnitureRequest] = field(default_factory=list)
+    without: set[str] = field(default_factory=set)  # what is not to be there
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,7 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     layout: dict[str, Any] = {
         "name": name if len(name) <= 60 else f"{name[:58].rsplit(' ', 1)[0].rstrip(' ,')}...",
         "seed": seed,
+        **_atmosphere(reader),
         "rooms": [],
         "doors": [],
         "windows": [],
@@ -105,7 +113,12 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     }
     x, names = 0.0, []
     for room in reader.rooms:
-        about = {**ROOMS[room.kind], **room.looks}
+        about = {**ROOMS[room.kind], **_looks(room, layout["style"])}
+        if (
+            _furnished(room, reader)
+            and sum(one.count for kept in reader.rooms for one in kept.things) < MOST_THINGS // 4
+        ):
+            _furnish(room, layout["style"], reader.moods, about)
         least = (1.6, 1.6, 2.3)  # a door must fit
         size = [round(max(a * b, c), 2) for a, b, c in zip(about.pop("size"), room.scale, least)]
         if any(one.label in ("stairs", "platform") for one in room.things):
@@ -122,6 +135,46 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     return ParsedText(read_layout(layout), layout, unknown, tuple(left_out), name)
 
 
+def _atmosphere(reader: "_Reader") -> dict[str, str]:
+    """The style and the time of a text."""
+    kinds = [room.kind for room in reader.rooms]
+    style = reader.style or next((ALWAYS[kind] for kind in kinds if kind in ALWAYS), "plain")
+    return {"style": style, "time": reader.time or ("night" if set(kinds) == {"dungeon"} else "day")}
+
+
+def _looks(room: _RoomText, style: str) -> dict[str, str]:
+    """The looks of a room's surfaces: those of the style, unless the text says others; a mere shade changes the style's."""
+    outdoors = ROOMS[room.kind].get("ceiling") == "sky"
+    own = {} if outdoors else {name: getattr(STYLES[style], name) for name in _SURFACES if getattr(STYLES[style], name)}
+    if room.kind in ("bathroom", "cellar", "garage") and style != "medieval":
+        own.pop("floor", None)
+    for name, look in room.looks.items():
+        usual = (
+            own.get(name)
+            or ROOMS[room.kind].get(name)
+            or {"floor": "planks", "walls": "plaster", "ceiling": "white plaster"}[name]
+        )
+        shades = all(word in looks.SHADES for word in look.split())
+        own[name] = f"{usual} {look}" if shades else look
+    return own
+
+
+def _furnished(room: _RoomText, reader: "_Reader") -> bool:
+    """Whether a room gets more things than the text names: where it gives a style, a mood or a time, and in kinds with a style."""
+    if reader.moods & EMPTY:
+        return False
+    return bool(reader.style or reader.moods or reader.time or room.kind in ALWAYS)
+
+
+def _furnish(room: _RoomText, style: str, moods: set[str], about: dict[str, Any]) -> None:
+    """Adds the usual things of a room that the text does not name."""
+    for label, count in furnishing(room.kind, style, moods).items():
+        if label not in room.without and not any(one.label == label for one in room.things):
+            room.things.append(FurnitureRequest(label, count, "", (1.0, 1.0, 1.0)))
+    if STYLES[style].lamp and any(one.label == STYLES[style].lamp for one in room.things):
+        about["lamps"] = 0
+
+
 class _Reader:
     """Reads a text word by word: `rooms` with their things, and the words without effect, `unknown`."""
 
@@ -136,7 +189,13 @@ class _Reader:
         self.relation = ""  # the last preposition
         self.noun, self.made_of = "", False  # the noun just read, and whether "of" followed it: "walls of red brick"
         self._forget()
-        self.words: list[str] = re.findall(r"[a-z0-9#]+|[,;.:]", text.lower())[:400]
+        self.style = self.time = ""
+        self.moods: set[str] = set()
+        joined = re.sub(
+            r"\b(tea|living|sitting) ?(room)", lambda at: at[1].replace("sitting", "living") + at[2], text.lower()
+        )
+        joined = re.sub(r"\b(coffee|low) (table)", "lowtable", joined)
+        self.words: list[str] = re.findall(r"[a-z0-9#]+|[,;.:]", joined)[:400]
         for at, word in enumerate(self.words):
             self.at = at
             self._read(word)
@@ -172,6 +231,12 @@ class _Reader:
             self._set_side(word)
         elif word in NUMBERS or word in GROUPS or word.isdigit():
             self._number(word)
+        elif word in STYLE_WORDS or word in MOODS or word in EMPTY:
+            self.style = STYLE_WORDS.get(word, self.style)
+            self.moods |= {word} if word not in STYLE_WORDS else set()
+        elif word in TIMES or word in SAME_TIME:
+            self.time = SAME_TIME.get(word, word)
+            self.placed, self.relation = False, ""
         elif noun in ROOMS:
             self._room(noun, word)
         elif noun in _SURFACES:
@@ -301,6 +366,7 @@ class _Reader:
                 room.things.append(self.last)
             else:
                 room.things = [one for one in room.things if one.label != noun]
+                room.without.add(noun)
 
     def _begin(self) -> None:
         """A room, if the text names none before its things."""
