@@ -62,7 +62,7 @@ def timed_play(
     episode's end.
 
     ms [steps]; joules [1] a step, with `estimated` [1] (bool); memory [2, K]: step, and bytes of the state and its arena rows that
-    the first state does not hold; shared [1], the bytes of arena rows that it does: the world's own memory."""
+    the first state does not hold; shared [1], the bytes of arena rows that it does."""
     shown = tuple(name for name in world.spec.channels if kind_of(name) == "rgb") or tuple(world.spec.channels)
     ends = restart is not None and "done" in world.spec.channels
     own = {key: size for key, size in memory_of([state]).items() if isinstance(key, tuple)}

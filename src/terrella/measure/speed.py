@@ -18,8 +18,8 @@ from .statistics import Figure
 from .work_units import Unit
 
 LEAD = (
-    "One imagined and rendered step of a single rollout: its time, its energy, and the memory that the rollout holds besides the "
-    "world's own. It depends on the machine and its load."
+    "One imagined and rendered step of a single rollout: its time, its energy, and the memory that the rollout adds. It depends on "
+    "the machine and its load."
 )
 
 

@@ -43,9 +43,9 @@ class Costs:
     frame_ms: float  # median of a step of one rollout, with its picture
     frame_joules: float
     imagined: tuple[Throughput, ...]  # without pictures: one rollout, and a batch
-    session_bytes: int  # of the state and its rows of arenas at the end, without the world's own memory
+    session_bytes: int  # of the state and its rows of arenas at the end, without those with which every session begins
     added_bytes: float  # per minute of play, over its last half
-    shared_bytes: int  # of the world's own memory, held once for all sessions
+    shared_bytes: int  # of rows with which every session begins, held once for all
     threads: int
     energy: str  # how joules were measured
 
@@ -78,7 +78,7 @@ class Costs:
                 "",
                 *table_lines(["", "time", "energy"], rows),
                 "",
-                f"memory: {own} a session after {self.steps:,} steps, {grows}; {shared} of the world, once for all sessions",
+                f"memory: {own} a session after {self.steps:,} steps, {grows}; besides {shared} with which every session begins",
                 f"{self.threads} threads; joules {self.energy}",
             ]
         )
