@@ -70,10 +70,9 @@ def depth_table(name: str, rows: list[tuple[np.ndarray, np.ndarray, list[float]]
         metric, scaled = np.array(values).mean(0)
         by = 1.96 * np.array(values).std(0)[0] / len(values) ** 0.5
         print(f"{name}, {label}: AbsRel {metric:.3f} (+-{by:.3f}), scaled {scaled:.3f}; {len(values)} pictures")
-    focal, pitch, height = np.nanmean(lens, 0)
-    print(
-        f"{name}: lens off by {100 * focal:.0f}%, pitch by {math.degrees(pitch):.1f} degrees, height by {100 * height:.0f}%"
-    )
+    focal, pitch, height = np.array(lens).T
+    height = f", height by {100 * height.mean():.0f}%" if np.isfinite(height).all() else ""
+    print(f"{name}: lens off by {100 * focal.mean():.0f}%, pitch by {math.degrees(pitch.mean()):.1f} degrees{height}")
 
 
 def held_out(count: int, size: tuple[int, int]):

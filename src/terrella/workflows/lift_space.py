@@ -19,7 +19,7 @@ from ..worlds.splat_folder import check_free, save_splat
 from .splat_places import SpaceResult
 
 MOST_ASPECT = 4.0
-UNSURE, FLAT, PLAIN = 0.25, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
+UNSURE, FLAT, PLAIN = 0.27, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
 EYE_M = (0.3, 2.2)  # heights of eyes that walk
 
 
@@ -60,8 +60,9 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
 def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
     """The place of a picture's layers, with a walker whose eyes are where its camera was."""
     gaussians, seen = to_gaussians(layers)
-    floor = floor_below(gaussians.at(seen), layers)
-    gaussians, seen = join([gaussians, floor]), torch.cat([seen, torch.zeros(len(floor), dtype=torch.bool)])
+    if float(layers.error.mean()) <= UNSURE:
+        floor = floor_below(gaussians.at(seen), layers)
+        gaussians, seen = join([gaussians, floor]), torch.cat([seen, torch.zeros(len(floor), dtype=torch.bool)])
     height, width = layers.depth.shape
     share = 256 / max(height, width)
     size = (max(round(height * share), 8), max(round(width * share), 8))
@@ -89,7 +90,7 @@ def doubts(layers: PictureLayers) -> list[str]:
         )
     if error > UNSURE:
         notes.append(
-            f"the depth is uncertain (expected error {100 * error:.0f}%, of rooms about 10%): the place may be wrong."
+            f"the depth is uncertain (expected error {100 * error:.0f}%, of rooms about 19%): the place may be wrong."
         )
     return notes
 
