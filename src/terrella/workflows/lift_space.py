@@ -120,7 +120,7 @@ def _result(layers: PictureLayers, world: SplatWorld, out: Path, notes: list[str
         "hidden_share": round(float((layers.hides > HIDES).float().mean()), 3), "notes": notes,
     }  # fmt: skip
     lines = [
-        f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented behind edges",
+        f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
         f"lens {facts['fov_deg']:.0f} degrees wide, camera {facts['height_m']:.2f} m above the floor, "
         f"pitch {facts['pitch_deg']:.0f} degrees; depth {near:.1f} to {far:.1f} m, "
         f"expected error {100 * facts['expected_error']:.0f}%",
