@@ -138,12 +138,12 @@ class OutcomeObjective:
             change = recorded + at["change"][:, step] - vitals
             predicted = outcome.judge(seen[:, step], at["action"][:, step], vitals, hidden)
             hidden = predicted.hidden
-            ends = outcome.ends(predicted.known, vitals + change)
+            own = vitals + self._drawn(predicted, now)  # an end is seen, too, where a vital that tells it was not drawn
+            ends = outcome.ends(predicted.known, torch.where(follows, own, vitals + change))
             error = negative_log_likelihood(
                 outcome.config, predicted, ends, at["reward"][:, step], at["done"][:, step], change
             )
             total = total + (weight.to(device) * error).mean() / LENGTH
-            own = vitals + self._drawn(predicted, now)
         yield Loss("outcome", total, {"outcome": total})
 
     def _drawn(self, predicted: OutcomeLogits, now: TrainStep) -> torch.Tensor:
