@@ -229,7 +229,7 @@ def _round(boxes: np.ndarray, shapes: np.ndarray) -> np.ndarray:
     """The longest cell on each block that is so round that longer ones would stand out from it [K], metres."""
     half = (boxes[:, 3:] - boxes[:, :3]) / 2
     tube = np.where(shapes[:, 1] > 0, 0.5 * half[:, :2].min(1), np.inf)
-    return np.maximum(np.minimum(tube, np.where(shapes[:, 4] > 0, 0.55 * half.min(1), np.inf)), 0.012)
+    return np.maximum(np.minimum(tube, np.where(shapes[:, 4] > 0, 0.45 * half.min(1), np.inf)), 0.012)
 
 
 def _weights(blocks: Blocks, objects: np.ndarray) -> np.ndarray:

@@ -61,6 +61,9 @@ def cells_of(
     sizes = np.stack([rows[:, 2] - rows[:, 1], rows[:, 4] - rows[:, 3]], 1) * step
     spread = OVERLAP + SMOOTH * np.clip(1 - contrast / PLAIN, 0, 1)
     low, high = np.stack([bits & 1, bits & 4], 1) > 0, np.stack([bits & 2, bits & 8], 1) > 0
+    spread = np.where(
+        np.isfinite(most[faces[rows[:, 0]] // 6]), OVERLAP, spread
+    )  # on round things long ones would stand out
     growing = np.where((np.stack([near & 1, near & 2], 1) > 0) | low | high, NEAR_EDGE, spread[:, None])
     spreads = np.where(low & high, AT_EDGE, growing)
     middles += INWARDS * sizes * (low * 1 - high)
@@ -81,13 +84,14 @@ def gaussians_of(cells: Cells, boxes: np.ndarray, shapes: np.ndarray, opacity: n
         at[rows[:, None], axes] = boxes[block[:, None], axes] + cells.middles + off * cells.sizes
         return bend(at, side, boxes[block], shapes[block])
 
-    means, normals = place(np.zeros(2))
+    means, outward = place(np.zeros(2))
     first = place(np.array([0.5, 0]))[0] - place(np.array([-0.5, 0]))[0]
     second = place(np.array([0, 0.5]))[0] - place(np.array([0, -0.5]))[0]
-    long_, other = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
-    normals = np.cross(first, second) * 1.0
-    flip = np.sign((normals * place(np.zeros(2))[1]).sum(1, keepdims=True))
-    normals = flip * normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = np.cross(first, second)
+    long_, area = np.linalg.norm(first, axis=1), np.linalg.norm(normals, axis=1)
+    other = area / np.maximum(long_, 1e-9)  # across the first edge, where a cell is slanted
+    flip = np.sign((normals * outward).sum(1, keepdims=True))
+    normals = flip * normals / np.maximum(area[:, None], 1e-12)
     x = first / np.maximum(long_, 1e-9)[:, None]
     turn = np.stack([x, np.cross(normals, x), normals], 2)  # columns
     scales = np.concatenate([cells.spreads * np.stack([long_, other], 1), np.full((len(block), 1), THIN_M)], 1)

@@ -62,6 +62,7 @@ class _Room:
         self.x1, self.y1 = self.x0 + w, self.y0 + d
         self.taken: list[Rect] = []  # where things stand
         self.clear: list[Rect] = []  # where nothing may
+        self.hung: list[Rect] = []  # what hangs on walls
         self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
 
     def fill(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[tuple[str, int]]:
@@ -179,7 +180,13 @@ class _Room:
             ways = [*spots[k : k + 1], *self._spots(one, kind.stands, size)]
             for margin in (APART_M, 0.25, 0.02):
                 spot = next(
-                    (spot for spot in ways if self._free(self._rect(spot, size), margin, kind.soft, one.label)), None
+                    (
+                        spot
+                        for spot in ways
+                        if self._free(self._rect(spot, size), margin, kind.soft, one.label)
+                        and self._unhung(spot, size, kind)
+                    ),
+                    None,
                 )
                 if spot:
                     break
@@ -217,6 +224,8 @@ class _Room:
         entry = {"label": one.label, "at": [round(x, 3), round(y, 3), z], "size": list(size), "facing": facing, **look}
         self.layout["things"].append(entry)
         rect = self._rect(spot, size)
+        if kind.stands == "hung":
+            self.hung.append(rect)
         if not kind.soft:
             self.taken.append(rect)
         if one.label in ("table", "desk", "lowtable"):
@@ -226,6 +235,10 @@ class _Room:
         x, y, facing = spot
         w, d = (size[1], size[0]) if facing in ("east", "west") else size[:2]
         return (x - w / 2, y - d / 2, x + w / 2, y + d / 2)
+
+    def _unhung(self, spot: tuple[float, float, str], size, kind) -> bool:
+        """Whether nothing hangs there yet."""
+        return kind.stands != "hung" or not any(_meet(self._rect(spot, size), other, 0.1) for other in self.hung)
 
     def _inside(self, rect: Rect) -> bool:
         low, high = (self.x0 - 1e-6, self.y0 - 1e-6), (self.x1 + 1e-6, self.y1 + 1e-6)

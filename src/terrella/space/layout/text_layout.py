@@ -47,7 +47,14 @@ _ONES = ("zero one two three four five six seven eight nine ten eleven twelve th
 NUMBERS = {**{word: at for at, word in enumerate(_ONES.split())}, "single": 1, "some": 3, "few": 3,
            "several": 4, "many": 6, "lots": 6}  # fmt: skip
 GROUPS = {"pair": 2, "pairs": 2, "couple": 2, "dozen": 12, "dozens": 12, "hundred": 100}
-PLURALS = {"pillar": 4, "chair": 4, "door": 2, "stairs": 1, "room": 2}  # how many without a number; of others 3
+PLURALS = {
+    "pillar": 4,
+    "chair": 4,
+    "door": 2,
+    "stairs": 1,
+    "room": 2,
+    "torch": 6,
+}  # how many without a number; of others 3
 SIDES = {"left": "north", "right": "south", "far": "east", "back": "east", "end": "east", "near": "west", "front": "west",
          "north": "north", "south": "south", "east": "east", "west": "west", "middle": "middle", "centre": "middle",
          "center": "middle", "corner": "corner"}  # fmt: skip
