@@ -71,6 +71,7 @@ def test_the_forecast_is_where_the_expected_error_reaches_the_level():
     other = forecast_trust(Fading(), 50, Fading().start(3, make_rng(0)))
     assert other is not None and other.steps == 20
     assert forecast_trust(Fading(card={}), 50) is None, "it cannot say how far off chance is"
+    assert forecast_trust(Fading(expects=0.0), 50) is None, "as a latent world of one member"
 
 
 def test_planners_and_practice_stop_there_and_say_so():

@@ -54,7 +54,8 @@ def forecast_trust(
     world: World, limit: int, state: State | None = None, policy: Policy | None = None, seed: int = 0
 ) -> TrustForecast | None:
     """How many steps from `state` (default: 8 starts of the world) can be trusted, of at most `limit`, under a policy (default:
-    held random actions) that is shown nothing. None for a world that expects no error."""
+    held random actions) that is shown nothing. None for a world that expects no error, or the same
+    at every step."""
     chance, rng = chance_error(world.spec), make_rng(seed)
     if not math.isfinite(chance) or limit < 1:
         return None
@@ -65,6 +66,8 @@ def forecast_trust(
         action, memory = act(policy, {}, memory, state.batch, world.spec, rng)
         state = world.imagine(state, action, rng)
         expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float().mean()))
+    if limit > 1 and max(expected) == min(expected):
+        return None
     level = trust_level(expected[0], chance)
     return TrustForecast(steps_within(torch.tensor(expected), level), limit, level, tuple(expected))
 
