@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from gymnasium import spaces
@@ -93,7 +95,8 @@ def test_an_episode_that_ends_begins_again():
 
 
 def test_settings_that_make_no_sense_get_a_sentence():
-    with pytest.raises(TerrellaError, match="--minutes is above 0"):
-        measure_costs("doom-maze", CostsConfig(minutes=0))
+    for minutes in (0, math.inf):
+        with pytest.raises(TerrellaError, match="--minutes is a number above 0"):
+            measure_costs("doom-maze", CostsConfig(minutes=minutes))
     with pytest.raises(TerrellaError, match="doom-maze"):
         measure_costs("doom-maz")

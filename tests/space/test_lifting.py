@@ -282,7 +282,7 @@ def test_what_cannot_be_lifted_is_refused_in_one_sentence_and_nothing_is_written
     long = picture_file(tmp_path / "long.png", (1280, 64))
     for path, words in (
         (tmp_path / "text.png", "cannot be read"),
-        (tmp_path / "none.png", "is not there"),
+        (tmp_path / "none.png", "does not exist; check the path"),
         (long, "4 to 1"),
     ):
         code, error = lifted(path, tmp_path, capsys)

@@ -1,5 +1,6 @@
 """`bench costs`: what a world costs in milliseconds, joules and bytes, per frame, per imagined second and per minute of play."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -57,7 +58,7 @@ class Costs:
     @property
     def flat(self) -> bool:
         """Whether memory grows by less than 10 KiB per minute."""
-        return abs(self.added_bytes) < 10 * 2**10
+        return self.added_bytes < 10 * 2**10
 
     def to_json(self) -> dict[str, Any]:
         return jsonable({**asdict(self), "watts": self.watts, "flat": self.flat})
@@ -87,8 +88,8 @@ class Costs:
 def measure_costs(world: str, config: CostsConfig | None = None, *, progress: Progress = silent) -> Costs:
     """Plays a world as a person would, with random actions, and imagines in it as a planner does: milliseconds, joules, bytes."""
     config = config or CostsConfig()
-    if not (config.minutes > 0 and config.batch >= 1):
-        raise TerrellaError("--minutes is above 0, and --batch is 1 or more.")
+    if not (0 < config.minutes < math.inf and config.batch >= 1):
+        raise TerrellaError("--minutes is a number above 0, and --batch is 1 or more.")
     mine = (
         library.load(world)
         if library.is_truth(world)

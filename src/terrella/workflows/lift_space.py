@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from ..core.errors import DatasetError, TerrellaError
 from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of, to_gaussians
@@ -97,11 +97,15 @@ def doubts(layers: PictureLayers) -> list[str]:
 
 def _frames(picture: Path) -> list[str]:
     """A note on pictures with several frames; DatasetError for a missing or unreadable one."""
+    if not picture.exists():
+        raise DatasetError(f"{picture} does not exist; check the path.")
     try:
         with Image.open(picture) as opened:
             many = getattr(opened, "n_frames", 1)
-    except (OSError, ValueError, UnidentifiedImageError, Image.DecompressionBombError):
-        return []  # read_picture says what is wrong
+    except Image.DecompressionBombError:
+        return []  # read_picture names the limit
+    except (OSError, ValueError) as fault:
+        raise DatasetError(f"{picture} cannot be read as a picture; save it as JPEG or PNG.") from fault
     return [f"the first of its {many} frames is used."] if many > 1 else []
 
 
@@ -123,7 +127,7 @@ def _result(layers: PictureLayers, world: SplatWorld, out: Path, notes: list[str
         f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
         f"lens {facts['fov_deg']:.0f} degrees wide, camera {facts['height_m']:.2f} m above the floor, "
         f"pitch {facts['pitch_deg']:.0f} degrees; depth {near:.1f} to {far:.1f} m, "
-        f"expected error {100 * facts['expected_error']:.0f}%",
+        f"expected error {100 * float(layers.error.mean()):.0f}%",
         *notes,
         f"walk in it: terrella play {out}",
     ]
