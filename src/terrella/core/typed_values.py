@@ -1,4 +1,4 @@
-"""Values of TOML and JSON as the types of frozen dataclasses, with a sentence for each mistake of whoever wrote the file."""
+"""Values of TOML and JSON as the types of frozen dataclasses, with a sentence for each mistake."""
 
 from dataclasses import MISSING, fields, is_dataclass
 from types import NoneType, UnionType
@@ -9,7 +9,7 @@ from .errors import TerrellaError
 
 def typed(hint: Any, value: Any, where: str, error: type[TerrellaError] = TerrellaError) -> Any:
     """A parsed value as the type `hint`: a dataclass, tuple, dict, Literal, number, str or bool, or a union of these. `error` where
-    the type is wrong, or a table has an unknown or missing key; `where` is the value's place in words."""
+    the type is wrong, or a table has an unknown or missing key; `where` names the value in messages."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         if value is None and NoneType in parts:

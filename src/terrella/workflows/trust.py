@@ -34,7 +34,7 @@ def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
     if forecast is None or not forecast.ends:
         return steps
     progress(
-        f"{world.spec.name} is not trusted beyond {forecast.steps} of {steps} steps: there it expects an error of "
+        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: there it expects an error of "
         f"{forecast.level:.2g}, half way to chance. Its {what} end there; --trust sets another limit."
     )
     return forecast.steps
