@@ -9,15 +9,17 @@ export class MiniMap {
   take(scene, top) {
     const ratio = Math.min(2, devicePixelRatio || 1), width = Math.round(this.canvas.clientWidth * ratio), height = Math.round(this.canvas.clientHeight * ratio);
     if (!width || !height) return;
-    const { means, scales, colours, opacities, length } = scene, some = [];
+    const { means, scales, colours, opacities, length, boxes } = scene, some = [];
     for (let k = 0; k < length; k += 1) if (means[3 * k + 2] < top && opacities[k] > 0.3) some.push(k);
-    const edge = (a, share) => Float32Array.from(some, (k) => means[3 * k + a]).sort()[Math.round(share * (some.length - 1))] ?? 0;
+    const walls = (a) => [Math.min(...boxes.map((one) => one[a])), Math.max(...boxes.map((one) => one[3 + a]))];  // windows show what lies beyond
+    const edge = (a, share) => boxes ? walls(a)[Number(share > 0.5)] : Float32Array.from(some, (k) => means[3 * k + a]).sort()[Math.round(share * (some.length - 1))] ?? 0;
     const box = [edge(0, 0.002) - 0.3, edge(0, 0.998) + 0.3, edge(1, 0.002) - 0.3, edge(1, 0.998) + 0.3], inset = 8 * ratio;
     const scale = Math.min((width - 2 * inset) / (box[1] - box[0]), (height - 2 * inset) / (box[3] - box[2]));
     Object.assign(this.canvas, { width, height });
     this.box = { scale, x: width / 2 - (scale * (box[0] + box[1])) / 2, y: height / 2 + (scale * (box[2] + box[3])) / 2 };
     const image = new ImageData(width, height), pixels = new Uint32Array(image.data.buffer), heights = new Float32Array(pixels.length).fill(-Infinity);
     for (const k of some) {
+      if (means[3 * k] < box[0] || means[3 * k] > box[1] || means[3 * k + 1] < box[2] || means[3 * k + 1] > box[3]) continue;
       const [u, v] = this.at(means[3 * k], means[3 * k + 1]), wide = Math.min(5 * ratio, Math.max(0.7, scale * Math.max(scales[3 * k], scales[3 * k + 1])));
       const shade = (part) => Math.min(255, Math.max(0, 20 + 225 * colours[3 * k + part])), ink = (255 << 24 | shade(2) << 16 | shade(1) << 8 | shade(0)) >>> 0;
       for (let y = Math.max(0, Math.round(v - wide)); y <= Math.min(height - 1, v + wide); y += 1) for (let x = Math.max(0, Math.round(u - wide)); x <= Math.min(width - 1, u + wide); x += 1) {
