@@ -101,9 +101,7 @@ class LatentPrediction:
         latents, blind = self._encode(batch, now)
         windows, predicted, error = self._rollout(latents, blind, batch, now)
         parts = {"prediction": error}
-        if (
-            config.pictured and config.frames > 1
-        ):  # so that a single picture, such as a goal, is near the same one in motion
+        if config.pictured and config.frames > 1:  # a single picture, such as a goal, is near the same one in motion
             parts["blind"] = (blind - latents[:, config.history - 1].detach()).square().mean()
         if not config.identity:  # which cannot collapse
             parts["sigreg"] = self._sigreg(latents, now)
