@@ -187,6 +187,7 @@ def test_what_cannot_be_learned_is_refused_in_a_sentence(vectors, tmp_path):
     refused(TrainingError, "multiples of 16", size=(30, 40))
     refused(TrainingError, "leaves nothing to see", pictures=False, vectors=False)
     refused(TrainingError, "--batch", batch=1)
+    refused(TrainingError, "1 to 16 pictures", frames=0)
     refused(DatasetError, "no pictures and no state vectors", vectors=False)
     refused(DatasetError, "--rollout 64", rollout=64)
     refused(DatasetError, "rows of a clip", history=16, data=drifting(tmp_path / "short", episodes=12, length=8))

@@ -99,6 +99,8 @@ def train_latent(
 def _check(config: LatentTraining) -> None:
     if config.size and any(side < COARSE or side % COARSE for side in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of {COARSE}.")
+    if not 1 <= config.frames <= 16:
+        raise TrainingError(f"--frames {config.frames}: a latent is made of 1 to 16 pictures.")
     sizes = (config.history, config.hidden, config.members)
     counts = (config.latent, config.rollout, config.steps, config.batch, config.leap or None, *sizes)
     if any(count is not None and count < 1 for count in counts) or (config.batch or 2) < 2 or config.history > 16:
