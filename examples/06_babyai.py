@@ -1,4 +1,4 @@
-"""Demonstrations for BabyAI's missions by the bot that comes with MiniGrid (pip install minigrid), which sees the whole room.
+"""Demonstrations for BabyAI's missions by the bot that comes with MiniGrid (pip install minigrid), which remembers what it saw.
 
     terrella record world gym:BabyAI-GoToObj-v0 --adapter examples/06_babyai.py --policy examples/06_babyai.py:teacher@0.1 \
         --out recordings/go --frames 20000 --pictures none

@@ -1,7 +1,7 @@
 """BabyAI by imitation: one policy for several levels, from the bot's demonstrations, judged on missions and on words never seen.
 
     python lab/babyai.py demonstrate OUT.npz GoToObj:800 GoToLocal:3000 PickupLoc:2500
-    python lab/babyai.py train OUT.npz RUN 3000          # steps
+    python lab/babyai.py train OUT.npz RUN 50            # minutes
     python lab/babyai.py judge RUN GoToObj GoToLocal PickupLoc --missions 512
 
 It needs `pip install minigrid`. Demonstrations go into arrays at once: recordings commit each short episode by itself, which takes
@@ -27,7 +27,7 @@ from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.feeds import RandomBatches
 from terrella.learn.objectives.imitation import BehaviourCloning
 from terrella.learn.recipes.imitation import Imitation, config_of
-from terrella.learn.recipes.policy import Practice
+from terrella.learn.recipes.policy import ENDLESS, Practice
 from terrella.learn.recording import Recording, controls_of
 from terrella.learn.trainer import Run, Trainer
 from terrella.measure.statistics import wilson
@@ -44,7 +44,7 @@ def demonstrate(out: str, levels: list[str]) -> None:
     """Arrays of all episodes of these levels (NAME:EPISODES)."""
     from minigrid.utils.baby_ai_bot import BabyAIBot
 
-    rows = {name: [] for name in ("image", "direction", "action", "valid", "task", "reward")}
+    rows = {name: [] for name in ("image", "direction", "action", "advice", "valid", "task", "reward")}
     tasks, ranges, rng = {}, [], np.random.default_rng(0)
     for level in levels:
         name, _, count = level.partition(":")
@@ -66,10 +66,10 @@ def demonstrate(out: str, levels: list[str]) -> None:
                 last = int(rng.integers(7)) if rng.random() < SLIPS else advice
                 seen, reward, ended, cut, _ = env.step(last)
                 done = ended or cut
-                rows["action"].append(last)
-                rows["reward"].append(reward)
-            rows["action"].append(0)
-            rows["reward"].append(0.0)
+                for key, value in zip(("action", "advice", "reward"), (last, advice, reward)):
+                    rows[key].append(value)
+            for key in ("action", "advice", "reward"):
+                rows[key].append(0)
             ranges.append((first, len(rows["valid"])))
         print(name, len(ranges), "episodes", len(rows["valid"]), "rows", len(tasks), "tasks", flush=True)
     np.savez_compressed(out, ranges=ranges, tasks=list(tasks), **{key: np.array(value) for key, value in rows.items()})
@@ -88,7 +88,7 @@ def opened(file: str) -> Recording:
     cache = SimpleNamespace(
         arrays=arrays, keys={"image": "observation.image", "direction": "observation.direction"}, absent={}, ranges=ranges,
         episodes=[tuple(one) for one in ranges.tolist()], length=len(data["task"]), tasks=tuple(data["tasks"].tolist()),
-        world=world, action=data["action"].astype(np.float32)[:, None], action_valid=data["valid"], reward=data["reward"],
+        world=world, action=data["advice"].astype(np.float32)[:, None], action_valid=data["valid"], reward=data["reward"],
         rgb=None,
     )  # fmt: skip
     start, usable, held = np.zeros(cache.length, np.int64), np.zeros(cache.length, bool), []
@@ -99,15 +99,17 @@ def opened(file: str) -> Recording:
     return Recording(cache, start, usable, controls_of(cache), None, tuple(held))
 
 
-def train(file: str, out: str, steps: int, history: int = 2) -> None:
-    recording, practice = opened(file), Practice(steps=steps, batch=128, learning_rate=2e-3)
-    torch.manual_seed(0)
-    network = ImitationNetwork(config_of(recording, ("image", "direction"), 128, Imitation(history=history)))
+def train(file: str, out: str, minutes: float, remember: int = 24, seed: int = 0) -> None:
+    recording = opened(file)
+    practice = Practice(batch=64 if remember else 128, learning_rate=2e-3, seed=seed)
+    torch.manual_seed(seed)
+    network = ImitationNetwork(config_of(recording, ("image", "direction"), 128, Imitation(remember=remember)))
     rows = DemonstrationRows.of(recording, network.config, torch.device("cpu"))
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
-    run = Run.of(out, practice, lambda done, total, text: print(text, flush=True), recording=file, history=history)
+    run = Run.of(out, practice, lambda done, total, text: print(text, flush=True), recording=file, remember=remember)
     feed = RandomBatches(lambda now: rows.sample(practice.batch, now.rng))
-    trainer = Trainer(run, "imitation", feed, BehaviourCloning(network, practice.learning_rate), steps)
+    trainer = Trainer(run, "imitation", feed, BehaviourCloning(network, practice.learning_rate), ENDLESS)
+    trainer.limit_s = 60 * minutes
     trainer.train(lambda: ImitationActor.write(network, Path(out) / "policy", {}))
     ImitationActor.write(network, Path(out) / "policy", {})
     print(copycat(network.eval(), rows.held_out, 2048), round(trainer.facts["seconds"]), "s")
@@ -163,7 +165,7 @@ if __name__ == "__main__":
     if what == "demonstrate":
         demonstrate(target, rest)
     elif what == "train":
-        train(target, rest[0], int(rest[1]), *map(int, rest[2:]))
+        train(target, rest[0], float(rest[1]), *map(int, rest[2:]))
     else:
         count = int(rest[rest.index("--missions") + 1]) if "--missions" in rest else 512
         judge(target, [one for one in rest if not one.startswith("-") and not one.isdigit()], count)

@@ -26,8 +26,9 @@ from terrella.core.instruction import bytes_to_text, text_to_bytes
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
 from terrella.data import record
-from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations
-from terrella.learn.recipes.imitation import Imitation, train_imitation
+from terrella.learn.demonstrations import DemonstrationRows
+from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations, condition
+from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
 from terrella.learn.recipes.policy import Practice
 from terrella.learn.trainer import TrainStep
 from terrella.sim.gymnasium import GymnasiumWorld
@@ -239,11 +240,73 @@ def test_a_copy_of_the_last_action_is_named(tmp_path):
         train_imitation(tmp_path / "recording", tmp_path / "other", QUICK, Imitation(outcome=True), quiet)
 
 
-def test_a_stopped_run_goes_on_exactly(fetch, tmp_path):
+class Recall(gymnasium.Env):
+    """Only the first observation shows which action, 0 or 2, the last step will reward."""
+
+    action_space, observation_space = spaces.Discrete(3), spaces.Box(-1, 1, (1,), np.float32)
+    metadata = {"render_modes": ["ansi"], "render_fps": 10}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.wanted, self.steps = int(self.np_random.integers(2)), 0
+        return np.full(1, 2 * self.wanted - 1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        over = self.steps == 6
+        return np.zeros(1, np.float32), float(over and action == 2 * self.wanted), over, False, {}
+
+
+class Minder:
+    """Does what the first observation showed, all the time."""
+
+    def begin(self, batch, rng):
+        return torch.zeros(batch)
+
+    def act(self, observation, memory, rng):
+        shown = observation["observation"][:, 0]
+        memory = torch.where(shown == 0, memory, shown)
+        return (memory + 1).long(), memory
+
+
+def test_what_the_first_observation_showed_is_remembered(tmp_path):
+    world = GymnasiumWorld(Recall)
+    record(world, Minder(), tmp_path / "recording", 900, make_rng(0))
+    won = {}
+    for name, imitation in {"memory": Imitation(remember=8), "last two": Imitation(history=2)}.items():
+        facts = train_imitation(tmp_path / "recording", tmp_path / name, QUICK, imitation, quiet)
+        won[name] = share_of_wins(world, ImitationActor.load(facts["policy"], world.spec))
+    assert won["memory"] == 1.0 and won["last two"] < 0.8
+
+
+def test_a_memory_in_play_is_that_of_training(fetch):
+    world, recording, facts = fetch
+    policy = ImitationActor.load(facts["policy"], world.spec)
+    torch.manual_seed(1)
+    config = replace(policy.network.config, remember=30)
+    policy = ImitationActor(ImitationNetwork(config).eval(), world.spec)
+    rows = DemonstrationRows.of(
+        open_demonstrations(recording, config.sees[:2], (64, 64), quiet)[0], config, torch.device("cpu")
+    )
+    first, stop = rows.recording.cache.episodes[3]
+    batch = rows.at(np.array([first, stop - 2]))
+    out = condition(policy.network, batch, batch.acted)[batch.requested]
+    memory, arrays = policy.begin(1, make_rng(0)), rows.recording.cache.arrays
+    for row in range(first, stop - 1):
+        text = text_to_bytes(rows.recording.cache.tasks[arrays["task"][row]])
+        seen = {"text": text, **{name: arrays[f"observation.{name}"][row] for name in ("grid", "wind")}}
+        action, memory = policy.act({k: torch.tensor(v)[None] for k, v in seen.items()}, memory, make_rng(0))
+        if row in (first, stop - 2):
+            assert int(action) == int(out[int(row > first)].argmax())
+    assert memory["features"].shape == (1, 1, config.actor.hidden)
+
+
+@pytest.mark.parametrize("imitation", [Imitation(), Imitation(remember=6)], ids=["history", "memory"])
+def test_a_stopped_run_goes_on_exactly(fetch, tmp_path, imitation):
     _, recording, _ = fetch
     config = replace(QUICK, steps=8, batch=8, hidden=8)
     goes_on_exactly(
-        lambda out: train_imitation(recording, out, config, Imitation(), quiet),
+        lambda out: train_imitation(recording, out, config, imitation, quiet),
         tmp_path / "whole",
         tmp_path / "cut",
         {"imitation": 3},

@@ -44,10 +44,11 @@ class ImitationActor:
 
     def begin(self, batch: int, rng: torch.Generator) -> State:
         config, width = self.network.config, self.network.config.action_width
+        seen = (1, config.actor.hidden) if config.remember else (config.history, self.network.width)
         return State(
             {
-                "features": torch.zeros(batch, config.history, self.network.width),
-                "acted": torch.zeros(batch, config.history, width),
+                "features": torch.zeros(batch, *seen),  # of the last observations, or the memory of all
+                "acted": torch.zeros(batch, config.window, width),
                 "chunk": torch.zeros(batch, config.chunk, width),
                 "taken": torch.full((batch,), -1),  # actions of the chunk that were taken; -1 at the start
             }
@@ -60,23 +61,26 @@ class ImitationActor:
         if missing := [name for name in self.sees if name not in observation]:
             raise ChannelError(f"the policy sees {', '.join(missing)}, which the observation lacks.")
         words = self._words(observation[TEXT]) if network.words is not None else None
-        features = network.features(observation, words).cpu()[:, None]
-        first = (memory["taken"] < 0)[:, None, None]
-        history = torch.where(first, features, torch.cat([memory["features"][:, 1:], features], 1))
+        device, features = network.mean.device, network.features(observation, words)[:, None]
+        if config.remember:
+            history, after = network.recall(features, memory["features"][:, 0].to(device))
+            kept = after[:, None].cpu()
+        else:
+            first, features = (memory["taken"] < 0)[:, None, None], features.cpu()
+            kept = history = torch.where(first, features, torch.cat([memory["features"][:, 1:], features], 1))
         seeds = chance.seeds(batch, rng, torch.device("cpu"))
         noise = chance.normal(seeds, (config.chunk * config.action_width,), _STREAM)
         chunk, taken = memory["chunk"], memory["taken"]
         anew = (taken < 0) | (taken >= config.execute)
         if anew.any():
-            device, wanted = network.mean.device, config.outcome
-            outcome = None if wanted is None else torch.full((batch,), wanted, device=device)
+            outcome = None if config.outcome is None else torch.full((batch,), config.outcome, device=device)
             out = network(history.to(device), memory["acted"].to(device), words, outcome)
             predicted = network.chunk(out, noise.to(device)).cpu()
             chunk, taken = torch.where(anew[:, None, None], predicted, chunk), torch.where(anew, 0, taken)
         encoded = chunk[torch.arange(batch), taken]
         acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
-        kept = {"features": history, "acted": acted, "chunk": chunk, "taken": taken + 1}
-        return config.decode(encoded, self.spec), State(kept)
+        after = {"features": kept, "acted": acted, "chunk": chunk, "taken": taken + 1}
+        return config.decode(encoded, self.spec), State(after)
 
     def unknown(self, text: str) -> tuple[str, ...]:
         """The words of an instruction that it does not know."""

@@ -36,10 +36,18 @@ class ImitationConfig:
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
     differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
+    remember: int = (
+        0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
+    )
 
     @property
     def sees(self) -> tuple[str, ...]:
         return (*(name for name, _ in self.actor.sees), *((TEXT,) if self.vocabulary else ()))
+
+    @property
+    def window(self) -> int:
+        """Observations from which it acts: with a memory one."""
+        return 1 if self.remember else self.history
 
     @property
     def action_width(self) -> int:
@@ -137,11 +145,13 @@ class ImitationNetwork(nn.Module):
         changes = 0
         if config.differences:
             self.register_buffer("change", torch.ones(width))
-            changes = (config.history - 1) * width
+            changes = (config.window - 1) * width
         self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
         self.width = width + actor.hidden * len(self.looks)
-        acted = config.history * config.action_width if config.own_actions else 0
-        into = config.history * self.width + changes + acted + words + (config.outcome is not None)
+        self.memory = nn.GRU(self.width, actor.hidden, batch_first=True) if config.remember else None
+        acted = config.window * config.action_width if config.own_actions else 0
+        seen = config.window * self.width + (actor.hidden if self.memory else 0) + changes
+        into = seen + acted + words + (config.outcome is not None)
         flow = actor.mode == AXES
         chunk = config.chunk * (config.action_width if flow else actor.outputs)
         self.trunk = mlp(into, actor.hidden, actor.layers, actor.hidden if flow else chunk, gain=1.0 if flow else 0.1)
@@ -160,6 +170,13 @@ class ImitationNetwork(nn.Module):
         flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
         return symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG)
 
+    def recall(self, features: torch.Tensor, memory: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features [N, T, width] with what is remembered beside them [N, T, width + hidden], and the memory after them [N, hidden].
+        memory: that before them; None at the start of an episode."""
+        assert self.memory is not None
+        recalled, last = self.memory(features, None if memory is None else memory[None])
+        return torch.cat([features, recalled], 2), last[0]
+
     def fit_normalization(self, seen: Mapping[str, torch.Tensor]) -> None:
         """Takes mean and deviation from observations [N * history, ...]; those that never vary keep 1."""
         if self._vectors:
@@ -167,13 +184,13 @@ class ImitationNetwork(nn.Module):
             self.mean.copy_(flat.mean(0))
             self.scale.copy_(_deviation(flat))
             if self.config.differences:
-                changes = self._numbers(seen).view(-1, self.config.history, len(self.mean)).diff(dim=1)
+                changes = self._numbers(seen).view(-1, self.config.window, len(self.mean)).diff(dim=1)
                 self.change.copy_(_deviation(changes.flatten(0, 1)))
 
     def forward(
         self, history: torch.Tensor, acted: torch.Tensor, words: torch.Tensor | None, outcome: torch.Tensor | None
     ) -> torch.Tensor:
-        """From features [N, history, width], own actions [N, history, A], the instruction's features and the return that is asked
+        """From features [N, window, width], own actions [N, window, A], the instruction's features and the return that is asked
         for [N]: logits [N, chunk * outputs], or for axes the condition [N, hidden] of the flow."""
         parts = [history.flatten(1)]
         if self.config.differences:

@@ -50,6 +50,7 @@ class WordEncoder(nn.Module):
 
     def forward(self, words: torch.Tensor) -> torch.Tensor:
         """[N, width]"""
+        words = words[:, : max(1, int((words != 0).any(0).sum()))]  # beyond, there are none
         if self.training:
             words = torch.where(torch.rand(words.shape, device=words.device) < DROPPED, 0, words)
         embedded = self.embed(words)

@@ -78,11 +78,32 @@ class DemonstrationRows:
         return self.at(rng.choice(self.rows, count))
 
     def at(self, rows: np.ndarray) -> Demonstrations:
-        """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero."""
-        config, cache, start = self.config, self.recording.cache, self.recording.start[rows]
+        """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero. For a policy that
+        remembers: windows that hold them, of whole episodes where these are short."""
+        if self.config.remember:
+            return self._windows(rows)
+        config, start = self.config, self.recording.start[rows]
         back = rows[:, None] + self.ahead - np.arange(config.history - 1, -1, -1)
         shown = back.clip(start[:, None], self.stop[rows][:, None] - 1).ravel()
-        seen = {}
+        return self._moments(rows, back, shown, rows)
+
+    def _windows(self, rows: np.ndarray) -> Demonstrations:
+        first = np.maximum(self.recording.start[rows], rows - self.config.remember + 1)
+        longest = min(self.config.remember, int((self.stop[rows] - first).max()))
+        steps = first[:, None] + np.arange(longest)
+        inside = steps < self.stop[rows][:, None]
+        moments = np.minimum(steps, self.stop[rows][:, None] - 1).ravel()
+        shown, places = np.unique(moments, return_inverse=True)
+        batch = self._moments(moments, moments[:, None], shown, rows)
+        weight = batch.weight * torch.from_numpy(inside.reshape(-1, 1)).to(self.device)
+        requested = torch.from_numpy(np.arange(len(rows)) * longest + rows - first)
+        windows = torch.from_numpy(places.reshape(steps.shape)).to(self.device)
+        return replace(batch, weight=weight, windows=windows, requested=requested)
+
+    def _moments(self, rows: np.ndarray, back: np.ndarray, shown: np.ndarray, spoken: np.ndarray) -> Demonstrations:
+        """The actions from `rows` [N] on and before the observations `back` [N, H], the observations `shown` and the
+        instructions of the rows `spoken`."""
+        config, cache, start, seen = self.config, self.recording.cache, self.recording.start[rows], {}
         for name, _ in config.actor.sees:
             array = array_for(name, cache.arrays, cache.keys)
             assert array is not None
@@ -94,8 +115,11 @@ class DemonstrationRows:
         ahead = np.minimum(ahead, self.stop[rows][:, None] - 1)
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
-        chunk, picked = self.actions[torch.from_numpy(ahead)], torch.from_numpy(rows)
-        words, outcome = (None if each is None else each[picked].to(self.device) for each in (self.words, self.outcome))
+        chunk = self.actions[torch.from_numpy(ahead)]
+        words, outcome = (
+            None if each is None else each[torch.from_numpy(of)].to(self.device)
+            for each, of in ((self.words, spoken), (self.outcome, rows))
+        )  # fmt: skip
         return Demonstrations(
             seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome
         )

@@ -18,7 +18,7 @@ SHIFT = 4  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """N moments of demonstrations."""
+    """N moments of demonstrations; for a policy that remembers all moments of N windows, one window after the other."""
 
     seen: Mapping[str, torch.Tensor]  # channel -> [N * history, ...], the oldest step of each moment first
     acted: torch.Tensor  # [N, history, A], the encoded actions before the moment
@@ -26,6 +26,8 @@ class Demonstrations:
     weight: torch.Tensor  # float32 [N, chunk] of each action in the loss, 0 beyond the episode
     words: torch.Tensor | None = None  # [N, WORDS], the instruction
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
+    windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
+    requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
 
 
 class BehaviourCloning:
@@ -57,10 +59,16 @@ def condition(
     """What the network makes of moments: logits, or the condition of the flow."""
     count, history = len(batch.chunk), network.config.history
     words = None if network.words is None or batch.words is None else network.words(batch.words)
-    every = None if words is None else words.repeat_interleave(history, 0)
     seen = {name: _moved(value, shift) for name, value in batch.seen.items()} if any(shift) else batch.seen
-    features = network.features(seen, every)
-    return network(features.view(count, history, -1), acted, words, batch.outcome)
+    if batch.windows is None:
+        features = network.features(seen, None if words is None else words.repeat_interleave(history, 0))
+        return network(features.view(count, history, -1), acted, words, batch.outcome)
+    of_row = torch.zeros(int(batch.windows.max()) + 1, dtype=torch.int64, device=batch.windows.device)
+    of_row[batch.windows] = torch.arange(len(batch.windows), device=of_row.device)[:, None].expand_as(batch.windows)
+    features = network.features(seen, None if words is None else words[of_row])
+    recalled = network.recall(features[batch.windows], None)[0].flatten(0, 1)[:, None]
+    every = None if words is None else words.repeat_interleave(batch.windows.shape[1], 0)
+    return network(recalled, acted, every, batch.outcome)
 
 
 def chunk_errors(network: ImitationNetwork, logits: torch.Tensor, chunk: torch.Tensor) -> torch.Tensor:

@@ -56,6 +56,9 @@ class Imitation:
     """Let the policy see its own last actions as well. Half of the time they are hidden in training."""
     chunk: int | None = None  # Actions that it predicts at once. Default: 8, for buttons and choices 1.
     execute: int | None = None  # Of these, actions that it takes before it predicts anew. Default: half of the chunk.
+    remember: int = 0
+    """Carry a memory through the episode (a GRU) instead of seeing the last observations; it learns on windows of this many steps.
+    Default: 0, none."""
     outcome: bool = False
     """Condition the policy on the return of the episode and ask for the best: failures teach what not to do."""
 
@@ -145,7 +148,7 @@ def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: 
     tasks = opened.cache.tasks if len(set(opened.cache.tasks)) > 1 else ()
     return ImitationConfig(
         actor, imitation.picture_size, vocabulary_of(tasks), imitation.history, imitation.own_actions, chunk, execute,
-        best_outcome(opened) if imitation.outcome else None,
+        best_outcome(opened) if imitation.outcome else None, remember=imitation.remember,
     )  # fmt: skip
 
 
@@ -167,7 +170,10 @@ def _shape(opened: Recording, name: str) -> tuple[int, ...] | None:
 
 def _check(practice: Practice, imitation: Imitation) -> None:
     counts = (imitation.history, imitation.chunk or 1, imitation.execute or 1, practice.hidden, practice.batch or 1)
-    if min(*counts, practice.steps or 1) < 1 or not (practice.minutes is None or practice.minutes > 0):
+    if min(*counts, imitation.remember + 1, practice.steps or 1) < 1 or not (
+        practice.minutes is None or practice.minutes > 0
+    ):
         raise TrainingError(
-            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, and --minutes is above 0."
+            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember is 0 or more, and --minutes is "
+            "above 0."
         )
