@@ -1,6 +1,6 @@
 """Measures `terrella space lift` on rooms, maps and tables that its training never saw.
 
-python benchmarks/lift.py [--rooms 60] [--views 24] [--games 60] [--data DIR]
+python benchmarks/lift.py [--rooms 60] [--views 24] [--games 60] [--store]
 
 Depth: AbsRel, the mean of |error| / truth, as it is and scaled by the median ratio, beside two baselines: a plane at the mean
 depth of the training (3 m), and a level floor at eye height with walls at 5 m. Views: the camera moves by 0.3 and 0.6 m; PSNR on
@@ -24,7 +24,7 @@ from scipy.ndimage import distance_transform_edt
 
 from terrella.space.camera import rays
 from terrella.space.lifting.layers import PictureLayers, layers_of, to_gaussians
-from terrella.space.lifting.network import load_lifter
+from terrella.space.lifting.network import WEIGHTS, load_lifter, save_lifter
 from terrella.space.lifting.pictures import random_pictures, render
 from terrella.space.lifting.scenes import Shot
 from terrella.space.lifting.textures import atlas_of
@@ -52,8 +52,8 @@ def floor_only(shape: tuple[int, int], focal: float) -> np.ndarray:
     return np.where(up < 0, np.minimum(EYE_M / np.maximum(-up, 1e-6), WALL_M), WALL_M)
 
 
-def depth_table(name: str, rows: list[tuple[np.ndarray, np.ndarray, list[float]]], lifter) -> None:
-    """AbsRel over pictures [H, W, 3] with depth [H, W] and lens."""
+def depth_table(name: str, rows: list[tuple[np.ndarray, np.ndarray, list[float]]], lifter) -> float:
+    """Prints AbsRel over pictures [H, W, 3] with depth [H, W] and lens; returns that of the lifter."""
     results: dict[str, list[tuple[float, float]]] = {}
     lens = []
     for rgb, truth, (focal, pitch, _, height) in rows:
@@ -73,6 +73,7 @@ def depth_table(name: str, rows: list[tuple[np.ndarray, np.ndarray, list[float]]
     focal, pitch, height = np.array(lens).T
     height = f", height by {100 * height.mean():.0f}%" if np.isfinite(height).all() else ""
     print(f"{name}: lens off by {100 * focal.mean():.0f}%, pitch by {math.degrees(pitch.mean()):.1f} degrees{height}")
+    return round(float(np.mean(results["lifted"], 0)[0]), 3)
 
 
 def held_out(count: int, size: tuple[int, int]):
@@ -175,16 +176,23 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=24)
     parser.add_argument("--games", type=int, default=60)
     parser.add_argument("--out", type=Path, help="folder for pictures of the views")
+    parser.add_argument(
+        "--store", action="store_true", help="write the errors of depth into the weights, for `space lift`"
+    )
     given = parser.parse_args()
     lifter = load_lifter()
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
     rows = held_out(max(given.rooms, given.views), (256, 256))
     lenses = [[shot.focal, shot.pitch, shot.roll, shot.height_m] for _, _, shot, _ in rows]
-    depth_table("rooms", [(row[0].rgb, row[0].depth, lens) for row, lens in zip(rows, lenses)][: given.rooms], lifter)
+    rooms = depth_table(
+        "rooms", [(row[0].rgb, row[0].depth, lens) for row, lens in zip(rows, lenses)][: given.rooms], lifter
+    )
     views(rows[: given.views], lifter, given.out)
-    if given.games:
-        games(given.games, lifter)
+    measured = {"rooms": rooms} | (games(given.games, lifter) if given.games else {})
+    if given.store:
+        lifter.measured = measured
+        save_lifter(lifter, WEIGHTS)
     picture = np.asarray(Image.fromarray(rows[0][0].rgb).resize((512, 512)))
     began, used = time.monotonic(), time.process_time()
     to_gaussians(layers_of(picture, lifter))
@@ -195,13 +203,14 @@ def main() -> None:
     )
 
 
-def games(count: int, lifter) -> None:
-    """Maps of Doom and tables that training never saw."""
+def games(count: int, lifter) -> dict[str, float]:
+    """AbsRel of maps of Doom and tables that training never saw."""
     from lifter_games import UNSEEN_MAPS, doom_pictures, robot_tables, table_pictures
 
-    depth_table("Doom's unseen maps", list(doom_pictures(UNSEEN_MAPS[:3], count, 9)), lifter)
+    doom = depth_table("Doom's unseen maps", list(doom_pictures(UNSEEN_MAPS[:3], count, 9)), lifter)
     rng = np.random.default_rng([HELD_OUT, 1])
-    depth_table("MuJoCo's robots at tables", list(table_pictures(robot_tables(), count, rng)), lifter)
+    tables = depth_table("MuJoCo's robots at tables", list(table_pictures(robot_tables(), count, rng)), lifter)
+    return {"Doom's maps": doom, "tables": tables}
 
 
 if __name__ == "__main__":

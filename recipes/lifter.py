@@ -106,7 +106,9 @@ def export(out: Path) -> None:
     if facts is None:
         raise SystemExit(f"{out}/run holds no run; python recipes/lifter.py train {out}")
     save_lifter(average.module, WEIGHTS)
-    print(f"{WEIGHTS}: {WEIGHTS.stat().st_size / 1e6:.1f} MB after {facts['step']:,} steps")
+    print(
+        f"{WEIGHTS}: {WEIGHTS.stat().st_size / 1e6:.1f} MB after {facts['step']:,} steps; now python benchmarks/lift.py --store"
+    )
 
 
 def main() -> None:

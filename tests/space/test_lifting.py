@@ -24,7 +24,7 @@ from terrella.space.lifting.layers import PictureLayers, floor_height, layers_of
 from terrella.space.lifting.network import Lifter, LifterConfig, load_lifter, save_lifter
 from terrella.space.lifting.scenes import rotation_of
 from terrella.space.raster import rasterise
-from terrella.workflows.lift_space import doubts, place_of
+from terrella.workflows.lift_space import doubts, expected_error, place_of
 
 TINY = LifterConfig(32, (8, 8, 16, 16))
 
@@ -191,6 +191,14 @@ def test_weights_are_read_back_and_foreign_files_refused(lifter, tmp_path):
     (tmp_path / "other.safetensors").write_bytes(b"no weights")
     with pytest.raises(CheckpointError, match="no lifter"):
         load_lifter(tmp_path / "other.safetensors")
+
+
+def test_the_error_to_expect_is_the_one_that_was_measured_with_the_weights(tmp_path):
+    measured = load_lifter().measured
+    assert set(measured) == {"rooms", "Doom's maps", "tables"} and 0.03 < measured["rooms"] < measured["tables"] < 1
+    assert "28% of rooms" in expected_error({"rooms": 0.279}) and "may be anything" in expected_error({"rooms": 0.279})
+    save_lifter(Lifter(TINY), tmp_path / "l.safetensors")
+    assert "not measured" in expected_error(load_lifter(tmp_path / "l.safetensors").measured)
 
 
 def shard(file, seed=0, count=8):

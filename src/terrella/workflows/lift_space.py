@@ -1,6 +1,7 @@
 """space lift: a place to walk in from one picture."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,10 +52,11 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
     focal = None
     if config.fov is not None:
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
-    layers = layers_of(rgb, load_lifter(), focal, config.eye)
+    lifter = load_lifter()
+    layers = layers_of(rgb, lifter, focal, config.eye)
     world = place_of(layers, picture.stem, {"picture": picture.name})
     save_splat(world, out)
-    return _result(layers, world, out, [*notes, *doubts(layers)])
+    return _result(layers, world, out, lifter.measured, [*notes, *doubts(layers)])
 
 
 def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
@@ -90,7 +92,8 @@ def doubts(layers: PictureLayers) -> list[str]:
         )
     if error > UNSURE:
         notes.append(
-            f"the depth is uncertain (expected error {100 * error:.0f}%, of rooms about 19%): the place may be wrong."
+            f"the network is unsure of the depth (it estimates an error of {100 * error:.0f}%, of pictures like its training's "
+            f"below {100 * UNSURE:.0f}%): the place may be wrong."
         )
     return notes
 
@@ -113,21 +116,32 @@ def _fov(layers: PictureLayers) -> float:
     return 2 * math.degrees(math.atan(0.5 / layers.camera[0]))
 
 
-def _result(layers: PictureLayers, world: SplatWorld, out: Path, notes: list[str]) -> SpaceResult:
+def expected_error(measured: Mapping[str, float]) -> str:
+    """In words what is known of the error of depth: that of kinds of pictures that training never saw, as it was measured."""
+    if not measured:
+        return "the error of depth was not measured with these weights"
+    known = ", ".join(f"{100 * error:.0f}% of {kind}" for kind, error in measured.items())
+    return f"error of depth to expect: {known}; of any other kind of picture it may be anything"
+
+
+def _result(
+    layers: PictureLayers, world: SplatWorld, out: Path, measured: Mapping[str, float], notes: list[str]
+) -> SpaceResult:
     near, far = layers.depth.flatten()[::7].quantile(torch.tensor([0.05, 0.95])).tolist()
     seen = int((world.provenance == OBSERVED).sum())
     facts = {
         "world": str(out), "gaussians": len(world.gaussians), "seen": seen, "invented": len(world.gaussians) - seen,
         "fov_deg": round(_fov(layers), 1), "pitch_deg": round(math.degrees(layers.pitch), 1),
         "roll_deg": round(math.degrees(layers.roll), 1), "height_m": round(layers.height_m, 2),
-        "near_m": round(near, 2), "far_m": round(far, 2), "expected_error": round(float(layers.error.mean()), 3),
+        "near_m": round(near, 2), "far_m": round(far, 2), "expected_error": dict(measured),
+        "own_error": round(float(layers.error.mean()), 3),
         "hidden_share": round(float((layers.hides > HIDES).float().mean()), 3), "notes": notes,
     }  # fmt: skip
     lines = [
         f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
         f"lens {facts['fov_deg']:.0f} degrees wide, camera {facts['height_m']:.2f} m above the floor, "
-        f"pitch {facts['pitch_deg']:.0f} degrees; depth {near:.1f} to {far:.1f} m, "
-        f"expected error {100 * float(layers.error.mean()):.0f}%",
+        f"pitch {facts['pitch_deg']:.0f} degrees; depth {near:.1f} to {far:.1f} m",
+        expected_error(measured),
         *notes,
         f"walk in it: terrella play {out}",
     ]
