@@ -274,6 +274,11 @@ def test_an_environment_without_its_gym_is_recognised(capsys):
     assert "did you mean 'gym:CartPole-v1'?" in refusal(["learn", "CartPole-v1"], capsys)
 
 
+def test_a_command_of_a_group_is_recognised_without_it(capsys):
+    assert "did you mean 'data convert'?" in refusal(["convert", "here"], capsys)
+    assert "did you mean 'data doctor'?" in refusal(["doctor"], capsys)
+
+
 def test_a_file_is_no_folder_to_record_to(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     assert "give a folder" in refusal(["play", "gym:CartPole-v1", "--record", tmp_path / "file"], capsys)

@@ -219,6 +219,15 @@ def test_what_is_nothing_known_is_said(tmp_path):
         open_source(tmp_path / "notes.txt")
     with pytest.raises(DatasetError, match="holds no recording"):
         open_source(tmp_path)
+    for name, way in (("demo.zarr", "h5py"), ("take.db3", "mcap convert"), ("rlds/x.tfrecord-00000-of-00002", "npz")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+        with pytest.raises(DatasetError, match=way):
+            open_source(tmp_path / name)
+    (tmp_path / "take.db3").unlink()
+    (tmp_path / "demo.zarr").unlink()
+    with pytest.raises(DatasetError, match="npz"):
+        open_source(tmp_path)
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (8, 8)).save(tmp_path / "photos" / "1.png")
     assert list(open_source(tmp_path / "photos", 5.0).sensors)

@@ -182,7 +182,12 @@ def _command(given: list[str]) -> tuple[str, list[str]]:
             break
         known = _members(group)
         if name not in known:
-            hint = did_you_mean(word, known if group else (*known, "help", "version"))
+            inside = [one for one in COMMANDS if not group and one.split()[-1] == word]  # of a group: data convert
+            hint = (
+                f"; did you mean '{inside[0]}'?"
+                if inside
+                else did_you_mean(word, known if group else (*known, "help", "version"))
+            )
             raise TerrellaError(f"there is no command '{name}'{hint or '.'} The commands are {', '.join(known)}.")
         group = name
     rest = given[len(group.split()) :]

@@ -1,8 +1,10 @@
 """convert: from any format that Terrella knows into any other; the format of a path is recognised from its content."""
 
+import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -51,6 +53,13 @@ _KINDS: dict[str, _Kind] = {
     "videos": _Kind("videos", "videos.read", "videos.write", VIDEOS, depth=2),
     "images": _Kind("images", "images.read", "images.write", IMAGES, depth=3),
 }
+_NO_KIND = {  # what to do with files of formats that are not read, by suffix
+    ".zarr": "copy its arrays under the same names (data/action, meta/episode_ends) into an .hdf5 file by h5py, and name that",
+    ".bag": "convert it to MCAP (`mcap convert IN.bag OUT.mcap`), and name that",
+    ".db3": "convert it to MCAP (`mcap convert IN.db3 OUT.mcap`), and name that",
+    ".pkl": "a pickle is not opened, for it may run code; save its arrays as an .npz file (numpy.savez), and name that",
+    ".tfrecord": "save each episode of this RLDS dataset as an .npz file of observations and actions, and name their folder",
+}
 _READ = ", ".join(kind.name for kind in _KINDS.values())
 
 
@@ -94,20 +103,29 @@ def _kind(path: Path) -> str:
     if path.is_file():
         kind = _by_suffix({path.suffix.lower()})
         if kind is None:
-            raise DatasetError(f"{path} is of no known format ({_READ}).")
+            raise DatasetError(f"{path} is of no known format ({_READ}){_way_in([path])}.")
         return kind
     if (path / INFO).exists() or (path / "meta" / "episodes").exists():
         return "lerobot"
     if (path / "data" / "main_data.hdf5").exists() or (path / "data" / "metadata.json").exists():
         return "minari"
-    folders = [path]
+    folders, seen = [path], [path]
     for _ in range(_MAX_DEPTH):
         files = [file for folder in folders for file in folder.iterdir() if not file.name.startswith(".")]
         kind = _by_suffix({file.suffix.lower() for file in files if file.is_file()})
         if kind:
             return kind
         folders = [folder for folder in files if folder.is_dir()]
-    raise DatasetError(f"{path} holds no recording of a known format ({_READ}).")
+        seen += files
+    raise DatasetError(f"{path} holds no recording of a known format ({_READ}){_way_in(seen)}.")
+
+
+def _way_in(paths: list[Path]) -> str:
+    """What to do with the first of these files and folders whose format is known but not read; "" where none is."""
+    named = (
+        way for path in paths for suffix, way in _NO_KIND.items() if re.search(rf"\{suffix}(\.|-|$)", path.name.lower())
+    )
+    return "".join(f"; {way}" for way in islice(named, 1))
 
 
 def _by_suffix(suffixes: set[str]) -> str | None:

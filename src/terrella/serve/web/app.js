@@ -172,6 +172,7 @@ function build() {
     $('score-cell').after(cell);
   }
   uncertainty.levels = worlds[worlds.length - 1].uncertainty;
+  uncertainty.measure = worlds[worlds.length - 1].card.kind === 'latent' ? 'Expected error of the latent state (100%: no better than its mean)' : 'Expected error of the picture, of full brightness';
   $('sync').hidden = worlds.length < 2;
   able($('rewind'), past.why, 'Hold to rewind (Backspace)');
   able($('record'), noRecord, 'Record to a dataset');

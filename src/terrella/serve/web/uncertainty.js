@@ -6,6 +6,7 @@ export class Uncertainty {
   constructor(root, fill) {
     Object.assign(this, { root, fill, value: -1, level: '', drifted: 0, shown: '' });
     this.limits = null;
+    this.measure = '';  // what the error is of, and in which unit
   }
 
   /** [the error that is usual for this world, that from which it invents, that by drift from which the position is lost, that beyond
@@ -36,8 +37,8 @@ export class Uncertainty {
     this.root.dataset.beyond = beyond;
     this.root.ariaValueMax = 1.6 * high;
     this.root.ariaValueNow = this.value;
-    this.root.title = `${WORDS[this.level]}. Expected error of the picture: ${percent(this.value)} of full brightness by invention, `
+    this.root.title = `${WORDS[this.level]}. ${this.measure}: ${percent(this.value)} by invention, `
       + `${percent(this.drifted)} by a position that has drifted. `
-      + (beyond ? 'Beyond trust: nearer to a random picture than to the true one' : 'Within trust');
+      + (beyond ? 'Beyond trust: nearer to a random one than to the truth' : 'Within trust');
   }
 }

@@ -27,7 +27,7 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
                 if min(width, height) < SMALLEST or width * height > MOST_PIXELS:
                     raise DatasetError(
                         f"{path} is {width} x {height} pixels; a picture has {SMALLEST} a side or more, and "
-                        f"{MOST_PIXELS // 1_000_000} million at most. Scale it, or take it away."
+                        f"{MOST_PIXELS // 1_000_000} million at most. Scale it."
                     )
                 if opened.mode in ("RGB", "L"):
                     opened.draft("RGB", (longest, longest))  # JPEGs decode faster when smaller
@@ -35,9 +35,9 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
     except DatasetError:
         raise
     except FileNotFoundError as error:
-        raise DatasetError(f"{path} is not there; put it back, or take it off the list.") from error
+        raise DatasetError(f"{path} is not there; check its name.") from error
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise DatasetError(f"{path} cannot be read as a picture; save it as JPEG or PNG, or take it away.") from error
+        raise DatasetError(f"{path} cannot be read as a picture; save it as JPEG or PNG.") from error
     picture = _rgb(picture)
     share = longest / max(picture.size)
     if share < 1:
