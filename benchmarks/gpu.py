@@ -29,7 +29,7 @@ import terrella  # noqa: E402
 from terrella.core import chance, make_rng  # noqa: E402
 from terrella.core.backend import tensor_programs  # noqa: E402
 from terrella.core.dispatch import Dispatches  # noqa: E402
-from terrella.learn.trainer import half_precision  # noqa: E402
+from terrella.learn.devices import half_precision  # noqa: E402
 from terrella.worlds.config import HistoryConfig  # noqa: E402
 from terrella.worlds.controls import AXES, Controls  # noqa: E402
 from terrella.worlds.flow import FlowConfig, FlowNetwork  # noqa: E402

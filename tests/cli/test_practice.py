@@ -25,6 +25,12 @@ def test_a_policy_practises_in_a_simulator_and_is_tried_there(tmp_path, capsys) 
     assert "takes actions in" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", [["--preset", "large"], ["--batch", "4"], ["--no-compile"], ["--no-half"]])
+def test_options_of_worlds_of_pictures_are_refused_with_practise(option, tmp_path, capsys):
+    assert main(["learn", "gym:CartPole-v1", "--practise", *option, "--out", str(tmp_path / "out")]) == 2
+    assert "are for worlds of pictures; --practise takes none." in capsys.readouterr().err
+
+
 def test_what_cannot_be_practised_is_said_in_a_sentence(tmp_path, capsys) -> None:
     (tmp_path / "file").write_text("")
     asked = ["train", "policy", "--in", "gym:CartPole-v1", "--out", str(tmp_path / "file" / "run"), *SHORT]

@@ -17,7 +17,7 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 from terrella.core import make_rng
 from terrella.learn.objectives.flow_frames import RECORDED, FlowClips, FlowFrames
 from terrella.learn.objectives.scroll import LENGTH, ScrollClips, ScrollObjective
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 
 _setup_privateuseone_for_python_backend("other")

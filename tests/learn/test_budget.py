@@ -11,7 +11,8 @@ from torch import nn
 
 from terrella.learn.budget import Budget
 from terrella.learn.feeds import RandomBatches
-from terrella.learn.trainer import Loss, Run, Trainer, adamw, warmup_cosine
+from terrella.learn.learners import adamw, warmup_cosine
+from terrella.learn.trainer import Loss, Run, Trainer
 
 
 @pytest.fixture

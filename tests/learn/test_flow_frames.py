@@ -18,7 +18,7 @@ from terrella.learn.moves import Scrolling, stitch_episodes
 from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import Recording
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world

@@ -30,7 +30,7 @@ from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations, condition
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
 from terrella.learn.recipes.policy import Practice
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
 from terrella.worlds.controls import Controls

@@ -22,7 +22,7 @@ from terrella.learn.recipes.parts import ObjectsTraining, train_objects
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recipes.video_config import video_config
 from terrella.learn.recording import THINGS, Recording, choose_keyframes
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.worlds.body import follow_stairs
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world, save_world

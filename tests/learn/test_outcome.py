@@ -15,7 +15,8 @@ from terrella.data import ClipCache, Recorder
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
 from terrella.learn.recording import Recording, controls_of
-from terrella.learn.trainer import Run, TrainStep
+from terrella.learn.train_step import TrainStep
+from terrella.learn.trainer import Run
 from terrella.worlds.config import VideoConfig
 from terrella.worlds.folder import load_world
 from terrella.worlds.frame_history import FrameHistory, StartClips

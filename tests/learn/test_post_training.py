@@ -21,7 +21,7 @@ from terrella.learn.objectives.dreams import DreamRollouts, dream_starts
 from terrella.learn.paired import open_paired
 from terrella.learn.recipes.post_training import distil, train_dreams
 from terrella.learn.recipes.video import train_video
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.worlds.checkpoint import data_file
 from terrella.worlds.folder import load_world
 from terrella.worlds.generator import generate

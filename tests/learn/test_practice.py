@@ -21,7 +21,7 @@ from terrella.learn.imagination import ContinuedEpisodes
 from terrella.learn.objectives.actor_critic import Critic, Range, ReturnConfig, lambda_returns, step_weights
 from terrella.learn.objectives.outcome import two_hot
 from terrella.learn.recipes.policy import Practice, train_policy
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 
 QUICK = Practice(steps=80, batch=64, horizon=5, hidden=32, learning_rate=1e-2, save_every_s=1e9)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import shutil
 import signal
 from dataclasses import dataclass
@@ -18,7 +20,9 @@ from torch import nn
 from terrella.core.errors import TrainingError
 from terrella.learn import trainer as module
 from terrella.learn.budget import Budget, Stage
-from terrella.learn.trainer import Ema, Loss, Run, Trainer, adamw, warmup_cosine
+from terrella.learn.learners import Ema, adamw, warmup_cosine
+from terrella.learn.sized_feed import SizedFeed
+from terrella.learn.trainer import Loss, Run, Trainer
 
 STEPS = 7
 
@@ -189,7 +193,8 @@ def test_a_run_goes_on_without_a_setting_that_is_gone(tmp_path):
     assert trainer_in(out, steps=2).finished
 
 
-def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path):
+def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "half_is_native", lambda device: False)
     broken = Toy(float("nan"))
     with pytest.raises(TrainingError, match="the loss is not a number at step 0"):
         trainer_in(tmp_path, objective=broken).train()
@@ -200,6 +205,56 @@ def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_pat
     with pytest.raises(TrainingError, match="the loss is not a number at step 3"):
         trainer_in(tmp_path, STEPS, Toy(float("nan"))).train()
     assert (tmp_path / "resume-toy.safetensors").read_bytes() == good
+
+
+def test_what_is_not_a_number_in_half_precision_goes_on_in_float32_from_the_last_save(tmp_path, monkeypatch):
+    class Halved(Toy):
+        def losses(self, batch, now):
+            self.scale = 1.0 if now.precise or now.step < 3 else float("nan")
+            yield from super().losses(batch, now)
+
+    monkeypatch.setattr(module, "half_is_native", lambda device: True)
+    objective = Halved()
+    with pytest.warns(UserWarning, match="in bfloat16 the loss is not a number at step 3: training goes on in float32"):
+        trainer_in(tmp_path, 3, objective).train()
+        trainer_in(tmp_path, STEPS, objective).train()
+    assert objective.begun == [0, 1, 2, 3, 3, 4, 5, 6] and saved_facts(tmp_path, "toy")["float32"]
+    assert all(math.isfinite(line["off"]) for line in logged(tmp_path, "toy") if "off" in line)
+    assert trainer_in(tmp_path, STEPS).facts["float32"], "it stays so"
+
+
+class Fed(Walk):
+    """Batches that fit on a device of a few."""
+
+    def __init__(self, size, fits):
+        super().__init__()
+        self.size, self.fits = size, fits
+
+    def batch(self, now):
+        if self.size > self.fits:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return super().batch(now)
+
+
+def test_a_device_out_of_memory_halves_the_batch_says_so_and_goes_on(tmp_path):
+    def trainer(size: int, fits: int = 2) -> Trainer:
+        feed = SizedFeed(lambda size: Fed(size, fits), size)
+        return Trainer(Run.of(tmp_path, Settings(), quiet), "toy", feed, Toy(), STEPS)
+
+    with pytest.warns(
+        UserWarning, match="cpu ran out of memory: the batch is halved to [42], and training goes on"
+    ) as said:
+        trainer(8).train()
+    assert [str(one.message).split("halved to ")[1][0] for one in said] == ["4", "2"]
+    resumed = trainer(8)
+    assert resumed.finished and resumed.facts["batch"] == 2, "the smaller batch is kept"
+    with (
+        pytest.warns(UserWarning),
+        pytest.raises(TrainingError, match="too little memory for a batch of 1; train smaller"),
+    ):
+        Trainer(
+            Run.of(tmp_path / "small", Settings(), quiet), "toy", SizedFeed(lambda size: Fed(size, 0), 2), Toy(), STEPS
+        ).train()
 
 
 def test_progress_says_step_and_rate(tmp_path):
@@ -251,7 +306,7 @@ def test_a_stage_takes_at_most_its_share(tmp_path):
 def test_a_machine_that_becomes_busy_leaves_training_one_thread(load, threads, tmp_path, monkeypatch):
     before = torch.get_num_threads()
     monkeypatch.setattr(module, "LOOK_S", -1.0)
-    monkeypatch.setattr(module.os, "getloadavg", lambda: (load * (module.os.cpu_count() or 1), 0.0, 0.0))
+    monkeypatch.setattr(os, "getloadavg", lambda: (load * (os.cpu_count() or 1), 0.0, 0.0))
     try:
         torch.set_num_threads(2)
         trainer_in(tmp_path, steps=2).train()

@@ -15,7 +15,7 @@ import terrella
 from terrella.cli import main
 from terrella.core.errors import CheckpointError, TerrellaError
 from terrella.learn.objectives.lifting import LayeredPictures, LiftingObjective
-from terrella.learn.trainer import TrainStep
+from terrella.learn.train_step import TrainStep
 from terrella.space.camera import rotation
 from terrella.space.kernels_numba import shapes as kernels
 from terrella.space.kernels_numba.light import first_box

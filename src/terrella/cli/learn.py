@@ -32,6 +32,11 @@ def learn(
         return show(world_workflow.learn(name, config, progress=say), json)
     if config.controls != ControlsConfig():
         raise TerrellaError("--keys, --action-names and --idle are for a person who plays; --practise takes none.")
+    plain = LearnConfig()
+    if any(getattr(config, name) != getattr(plain, name) for name in ("preset", "batch", "compile", "half")):
+        raise TerrellaError(
+            "--preset, --batch, --no-compile and --no-half are for worlds of pictures; --practise takes none."
+        )
     shared = (config.minutes, config.out, config.frames, config.seed, config.environment, config.device)
     rounds = policy_workflow.PractiseConfig(*shared)
     practised = policy_workflow.practise(name, rounds, progress=say)

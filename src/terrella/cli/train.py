@@ -5,6 +5,7 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from ..learn.devices import describe_device, device_named
 from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining
 from ..learn.recipes.latent_actions import LatentActionsConfig, train_latent_actions
@@ -18,7 +19,6 @@ from ..learn.recipes.parts import (
 )
 from ..learn.recipes.post_training import DistilConfig, DreamsConfig, distil, train_dreams
 from ..learn.recipes.video import TrainConfig
-from ..learn.trainer import device_named
 from ..library import folder_of
 from ..workflows.opening import Device, load_named
 from ..workflows.progress import Report
@@ -169,4 +169,6 @@ def _playing(out: str) -> str:
 
 
 def _learned(name: str, device: str) -> LearnedWorld:
-    return load_world(folder_of(name), device=str(device_named(device)))
+    chosen = str(device_named(device))
+    say(f"{name} trains on {describe_device(chosen)}.")
+    return load_world(folder_of(name), device=chosen)

@@ -13,7 +13,7 @@ from ..space.reproject import carry_unknown
 from ..worlds.config import THUMBNAIL, VideoConfig
 from ..worlds.generator import Conditioning, UNet, context_thumbnail, decode_depth, encode_depth, generate, pixels
 from .recording import Recording
-from .trainer import TrainStep
+from .train_step import TrainStep
 
 # Dream(conditioning, now) -> frames [B, 4 or 5, H, W] as the generator under training draws them, on the CPU
 Dream = Callable[[Conditioning, TrainStep], torch.Tensor]

@@ -12,7 +12,8 @@ from ..worlds.config import VideoConfig
 from .batches import Dream, place_batch
 from .moving_batches import moving_batch
 from .recording import Recording
-from .trainer import Feed, TrainStep
+from .sized_feed import Feed
+from .train_step import TrainStep
 
 
 class RandomBatches:
@@ -43,7 +44,8 @@ class ClipStream:
         return self.clips.state()
 
     def resume(self, state: Mapping) -> None:
-        self.clips.resume(state)
+        if state:  # empty where batches were cut from a recording on a GPU, in no order
+            self.clips.resume(state)
         self._stream = None
 
 

@@ -23,7 +23,7 @@ from ..core.world import World, make_rng
 from .growth import Growth
 from .latent_validation import state_at
 from .recording import Recording
-from .trainer import TrainStep
+from .train_step import TrainStep
 
 MOST_STARTS = 8192  # states of a recording in which rollouts begin
 CONTEXT = 2  # rows before them that the world observes

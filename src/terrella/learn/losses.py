@@ -6,7 +6,8 @@ from torch import nn
 
 from ..space.keyframes import Glimpse, merge
 from .batches import Batch
-from .trainer import Learner, half_precision
+from .devices import half_precision
+from .learners import Learner
 
 
 class PatchCritic(nn.Module):

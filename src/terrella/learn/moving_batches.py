@@ -11,7 +11,7 @@ from ..worlds.controls import BUTTONS
 from ..worlds.generator import Conditioning, context_thumbnail, decode_depth, encode_depth, pixels
 from .batches import Batch, Dream, PlaceViews, encode_rgb
 from .recording import Recording
-from .trainer import TrainStep
+from .train_step import TrainStep
 
 OFTEN = (0.4, 0.3, 0.2, 0.1)  # probabilities of 0, 1, 2, 3 generated frames
 COUNTS = 4.0  # additional weight of a pixel of a moving thing: otherwise a distant monster would be ignored

@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from .trainer import Ema, Learner, TrainStep
+from .learners import Ema, Learner
+from .train_step import TrainStep
 
 ROUNDS, QUINTIC = 5, (3.4445, -4.7750, 2.0315)  # of Newton and Schulz; the polynomial is Jordan's
 MOMENTUM = 0.95

@@ -13,7 +13,8 @@ from ..worlds.learned import LearnedWorld
 from .batches import Dream
 from .feeds import place_feed
 from .recording import INSTANCES, OBJECTS, THINGS, Box, Recording, box_of
-from .trainer import Feed, Report
+from .sized_feed import Feed
+from .trainer import Report
 
 
 @dataclass(frozen=True)

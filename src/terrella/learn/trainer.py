@@ -6,19 +6,18 @@ step under way ends, the run is saved and stops; the same command resumes exactl
 
 from __future__ import annotations
 
-import copy
 import itertools
 import json
 import math
-import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -27,99 +26,19 @@ from torch import nn
 from ..core.errors import TrainingError
 from ..core.world import make_rng
 from .budget import Budget
+from .devices import half_is_native, yield_cores
+from .learners import Learner
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
+from .sized_feed import Feed, SizedFeed
+from .train_step import TrainStep
 
 Report = Callable[[float, float, str], None]
 Paced = Callable[[int], None]
 LOG_EVERY = 20  # steps
 PACE_S = 30.0  # of training after which its pace is known, or sooner: after the first picture
 LOOK_S = 30.0  # between looks at how busy the machine is
-BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 CPU = torch.device("cpu")
 RETIRED = ("generator",)  # settings of earlier runs that no longer exist
-Module = TypeVar("Module", bound=nn.Module)
-
-
-@dataclass(frozen=True)
-class TrainStep:
-    """One training step. share: the part of the training that lies before it, by steps or by time, whichever is more;
-    rng, noise: its randomness, seeded by (seed, step)."""
-
-    step: int
-    share: float
-    device: torch.device
-    rng: np.random.Generator
-    noise: torch.Generator = field(repr=False)
-
-    def randn(self, *shape: int) -> torch.Tensor:
-        """Standard normal noise on the device; drawn on the CPU, so that it is the same on any device."""
-        return torch.randn(*shape, generator=self.noise).to(self.device)
-
-    def rand(self, *shape: int) -> torch.Tensor:
-        """Uniform noise in 0..1, likewise."""
-        return torch.rand(*shape, generator=self.noise).to(self.device)
-
-    def half(self) -> torch.autocast:
-        """A context in which networks compute in half precision, where that is native."""
-        return half_precision(self.device)
-
-
-class Ema(nn.Module, Generic[Module]):
-    """An exponential moving average of a module's weights, which play uses; its decay ramps up to `limit`."""
-
-    updates: torch.Tensor
-    module: Module
-
-    def __init__(self, raw: Module, limit: float):
-        super().__init__()
-        self.limit, self.module = limit, copy.deepcopy(raw).eval().requires_grad_(False)
-        self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
-
-    @torch.no_grad()
-    def update(self, raw: nn.Module) -> None:
-        number = int(self.updates)
-        keep = min(self.limit, (number + 1) / (number + 20))
-        for mean, weight in zip(self.module.parameters(), raw.parameters()):
-            mean.lerp_(weight, 1 - keep)
-        self.updates += 1
-
-
-@dataclass(frozen=True)
-class Learner:
-    """An optimiser and the modules whose parameters it updates.
-
-    rate:    the learning rate at a step, times the "pace" of each parameter group that has one; None: constant.
-    average: of the first module's weights.
-    clip:    the norm to which each module's gradient is clipped.
-    """
-
-    optimiser: torch.optim.Optimizer
-    modules: Sequence[nn.Module]
-    rate: Callable[[TrainStep], float] | None = None
-    average: Ema[Any] | None = None
-    clip: float = 1.0
-
-
-def adamw(
-    modules: Sequence[nn.Module],
-    rate: Callable[[TrainStep], float],
-    decay: float = 1e-4,
-    betas: tuple[float, float] = (0.9, 0.99),
-    average: Ema[Any] | None = None,
-) -> Learner:
-    """AdamW for all parameters of the modules."""
-    weights = [weight for module in modules for weight in module.parameters()]
-    return Learner(torch.optim.AdamW(weights, betas=betas, weight_decay=decay), modules, rate, average)
-
-
-def warmup_cosine(peak: float, steps: int, low: float = 0.0) -> Callable[[TrainStep], float]:
-    """Linear warm-up to `peak` over `steps` steps, then cosine decay to `low` times it over the training."""
-    return lambda now: peak * min(1, (now.step + 1) / steps) * cosine_decay(now.share, low)
-
-
-def hold_then_decay(peak: float, steps: int) -> Callable[[TrainStep], float]:
-    """Linear warm-up to `peak` over `steps` steps, constant, then linear decay to 0 over the last 30% of the training."""
-    return lambda now: peak * min(1, (now.step + 1) / steps, (1 - now.share) / 0.3)
 
 
 @dataclass(frozen=True)
@@ -140,14 +59,6 @@ class Objective(Protocol):
     @property
     def learners(self) -> Mapping[str, Learner]: ...
     def losses(self, batch: Any, now: TrainStep) -> Iterator[Loss]: ...
-
-
-class Feed(Protocol):
-    """What is learned from. `state` gives JSON values that describe the position after the last batch; `resume` restores it."""
-
-    def batch(self, now: TrainStep, /) -> Any: ...
-    def state(self) -> dict: ...
-    def resume(self, state: Mapping) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -228,9 +139,9 @@ class Trainer:
         saved = run.saved_facts(stage)
         for module in objective.modules.values():
             module.to(self.device)
+        self._finite: list[torch.Tensor] = []  # of the steps since losses were last read
         if saved:
-            self.facts |= load_run(self._file, objective.modules, self._optimisers) or {}
-            feed.resume(self.facts["feed"])
+            self._load()
         trim_log(run.out, stage, self.steps_done)
 
     @property
@@ -274,9 +185,8 @@ class Trainer:
         began = saved = drawn = looked = time.monotonic()
         before, first = facts["seconds"], self.steps_done
         while not self.finished and not stop.is_set():
-            parts = self._step(facts["step"])
-            facts["step"] += 1
-            facts["recent"].append(parts)
+            if not self._completed_step():
+                continue
             now = time.monotonic()
             facts["seconds"] = before + now - began
             if len(facts["recent"]) == LOG_EVERY or self.finished:
@@ -300,6 +210,58 @@ class Trainer:
             done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"
             raise KeyboardInterrupt(f"{done}; the same command continues.")
 
+    def _completed_step(self) -> bool:
+        """Takes a step, unless the device has no memory for it, or half precision gives what is not a number: it is repeated with
+        half of the batch, or in float32."""
+        facts = self.facts
+        try:
+            facts["recent"].append(self._step(facts["step"]))
+            facts["step"] += 1
+            if len(facts["recent"]) == LOG_EVERY or self.finished:
+                self._check_finite()
+            return True
+        except torch.OutOfMemoryError:
+            if not isinstance(self.feed, SizedFeed):
+                raise
+        except _NotFinite as error:
+            self._go_on_in_float32(error)
+            return False
+        self._halve_batch()  # here the tensors of the step are free
+        return False
+
+    def _halve_batch(self) -> None:
+        feed = self.feed
+        assert isinstance(feed, SizedFeed)
+        if feed.size < 2 * feed.least:
+            raise TrainingError(
+                f"{self.device} has too little memory for a batch of {feed.size}; train smaller pictures or networks, or on the "
+                "CPU (--device cpu)."
+            )
+        feed.resize(feed.size // 2)
+        torch.cuda.empty_cache()
+        half = f"the batch is halved to {feed.size}, and training goes on"
+        warnings.warn(f"{self.device} ran out of memory: {half}.", stacklevel=2)
+
+    def _go_on_in_float32(self, error: TrainingError) -> None:
+        """From the last save, without one from these weights: no step that was not a number changed them."""
+        if self.facts.get("float32") or not half_is_native(self.device):
+            raise error
+        self._finite.clear()
+        if self._file.exists():
+            self._load()
+        self.facts |= {"float32": True, "recent": []}
+        warnings.warn(
+            f"in bfloat16 {str(error).partition(';')[0]}: training goes on in float32 from step {self.steps_done}.",
+            stacklevel=2,
+        )
+
+    def _load(self) -> None:
+        """Restores the last save, with batches as large as then."""
+        self.facts |= load_run(self._file, self.objective.modules, self._optimisers) or {}
+        if isinstance(self.feed, SizedFeed):
+            self.feed.resize(self.facts.get("batch", self.feed.size))
+        self.feed.resume(self.facts["feed"])
+
     def time_steps(self, most_s: float) -> float:
         """Seconds of a gradient step, timed for about `most_s` after a first one, by three at least. It changes the modules."""
         began, ends = time.monotonic(), list[float]()
@@ -313,41 +275,73 @@ class Trainer:
                     return (ends[-1] - ends[0]) / (len(ends) - 1)
         raise AssertionError  # a feed never ends
 
-    def _step(self, step: int) -> dict[str, float]:
-        """One batch, and one gradient step for each of its losses in turn. Returns the means of the losses' parts."""
+    def _step(self, step: int) -> dict[str, list[torch.Tensor]]:
+        """One batch, and one gradient step for each of its losses in turn. Returns the losses' parts, which the device may still be
+        computing."""
         rng = np.random.default_rng([self.run.seed, step])
-        noise = make_rng(int(rng.integers(2**62)))
-        now = TrainStep(step, self.share, self.device, rng, noise)
+        noise = make_rng(int(rng.integers(2**62)), "cuda" if self.device.type == "cuda" else "cpu")
+        now = TrainStep(step, self.share, self.device, rng, noise, self.facts.get("float32", False))
         for learner in self.objective.learners.values():
             if learner.rate is not None:
                 for group in learner.optimiser.param_groups:
                     group["lr"] = learner.rate(now) * group.get("pace", 1.0)
-        parts: dict[str, list[float]] = {}
+        parts: dict[str, list[torch.Tensor]] = {}
         with torch.random.fork_rng([self.device] if self.device.type == "cuda" else []):
             torch.manual_seed(int(rng.integers(2**62)))  # dropout takes no generator
             for loss in self.objective.losses(self.feed.batch(now), now):
                 self._descend(loss, step * self.strides)
                 for name, part in loss.parts.items():
-                    parts.setdefault(name, []).append(float(part.detach()))
-        return {name: float(np.mean(values)) for name, values in parts.items()}
+                    parts.setdefault(name, []).append(part.detach())
+        return parts
+
+    def _read_losses(self) -> None:
+        """Waits for the device: makes numbers of the losses since the last time."""
+        recent = self.facts["recent"]
+        waiting = [
+            value for parts in recent for values in parts.values() if isinstance(values, list) for value in values
+        ]
+        if waiting:
+            numbers = iter(torch.stack([value.double() for value in waiting]).tolist())
+            for parts in recent:
+                parts |= {
+                    name: float(np.mean([next(numbers) for _ in values]))
+                    for name, values in parts.items()
+                    if isinstance(values, list)
+                }
+
+    def _check_finite(self) -> None:
+        """Waits for the device. TrainingError if a loss or a gradient was not a number since the last time."""
+        finite, self._finite = self._finite, []
+        if finite and not bool(torch.stack(finite).all()):
+            raise _NotFinite(_not_a_number("a loss or a gradient", self.facts["step"] * self.strides))
 
     def _descend(self, loss: Loss, step: int) -> None:
         """One gradient step."""
-        learner = self.objective.learners[loss.learner]
-        if not torch.isfinite(loss.value):
-            raise TrainingError(_not_a_number("the loss", step))
+        learner, waits = self.objective.learners[loss.learner], self.device.type == "cpu"
+        finite = torch.isfinite(loss.value.detach())
+        if waits and not finite:
+            raise _NotFinite(_not_a_number("the loss", step))
         learner.optimiser.zero_grad()
         loss.value.backward()
         for module in learner.modules:
-            if not torch.isfinite(nn.utils.clip_grad_norm_(module.parameters(), learner.clip)):
-                raise TrainingError(_not_a_number("a gradient", step))
+            finite = finite & torch.isfinite(nn.utils.clip_grad_norm_(module.parameters(), learner.clip))
+        if waits and not finite:
+            raise _NotFinite(_not_a_number("a gradient", step))
+        if not waits:  # another device is asked only now and then; until then what is not a number is no step
+            for weight in (weight for module in learner.modules for weight in module.parameters()):
+                if weight.grad is not None:
+                    weight.grad.masked_fill_(~finite, 0)
+            self._finite.append(finite)
         learner.optimiser.step()
         if learner.average is not None:
             learner.average.update(learner.modules[0])
 
     def save(self) -> None:
         """Saves the run as it is after its last whole step."""
+        self._read_losses()
         self.run.out.mkdir(parents=True, exist_ok=True)
+        if isinstance(self.feed, SizedFeed):
+            self.facts["batch"] = self.feed.size
         self.facts |= {"feed": self.feed.state(), "spent": self.run.budget.spent_s}
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)
 
@@ -359,6 +353,7 @@ class Trainer:
         return self.facts[name]
 
     def _log(self, steps_per_s: float) -> None:
+        self._read_losses()
         facts, recent = self.facts, self.facts["recent"]
         mean = {name: float(np.mean([one[name] for one in recent if name in one])) for name in recent[-1]}
         line = {"stage": self.stage, "step": self.steps_done, "seconds": round(facts["seconds"]), **mean}
@@ -367,6 +362,10 @@ class Trainer:
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
         pace = f"{steps_per_s:.1f} steps/s" if steps_per_s >= 1 else f"{1 / steps_per_s:.1f} s a step"
         self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: step {self.steps_done:,}, {pace}, {words}")
+
+
+class _NotFinite(TrainingError):
+    """A loss or a gradient is not a number."""
 
 
 def _not_a_number(what: str, step: int) -> str:
@@ -393,38 +392,3 @@ def _stoppable() -> Iterator[threading.Event]:
         yield stop
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def cosine_decay(share: float, low: float = 0.0) -> float:
-    """From 1 down to `low` as `share` goes from 0 to 1."""
-    return low + (1 - low) * (0.5 + 0.5 * float(np.cos(np.pi * min(share, 1.0))))
-
-
-def half_precision(device: torch.device) -> torch.autocast:
-    """bfloat16 where the device computes it natively."""
-    avx512 = device.type == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX512"
-    native = device.type == "cuda" or avx512 and _cpu_has_bf16()
-    return torch.autocast(device.type if native else "cpu", torch.bfloat16, enabled=native)
-
-
-def _cpu_has_bf16() -> bool:
-    """Whether in hardware: emulated by oneDNN it is 2.7 times slower than float32."""
-    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
-
-
-def yield_cores() -> None:
-    """Sets PyTorch to one thread where other processes use all cores: its threads would wait for each other."""
-    if os.getloadavg()[0] > BUSY * (os.cpu_count() or 1):
-        torch.set_num_threads(1)
-
-
-def device_named(name: str) -> torch.device:
-    """cpu, cuda, or auto (CUDA if there is one, else the CPU). TrainingError for a device that PyTorch does not have here."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-        return device
-    except (RuntimeError, AssertionError, NotImplementedError, ModuleNotFoundError):
-        raise TrainingError(f"--device {name}: PyTorch has no such device here; say cpu, cuda or auto.") from None

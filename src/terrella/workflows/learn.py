@@ -12,14 +12,15 @@ from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
 from ..data import Dataset, RecordOptions
 from ..data.recording import LONGEST
+from ..learn.devices import describe_device, yield_cores
+from ..learn.presets import PresetName
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
-from ..learn.trainer import yield_cores
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from .collect import explore, storage_of
 from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
-from .opening import ControlsConfig, Device, EnvironmentConfig, describe_device, device_of
+from .opening import ControlsConfig, Device, EnvironmentConfig, device_of
 from .progress import Progress, Report, duration, silent, stage, stopping_with
 from .recording_facts import describe, recording_facts
 from .results import changed_settings, command, jsonable
@@ -56,6 +57,12 @@ class LearnConfig:
     """Who plays while it records, as for `record world`; default: a script that explores."""
     seed: int = 0  # The same seed gives the same result.
     device: Device = "auto"
+    # Size of the network of a world without depth: small, medium, large or huge (see `train video`). Default: by device and
+    # minutes.
+    preset: PresetName = "auto"
+    batch: int | None = None  # Frames per training step. Default: 8 on a CPU, 64 on a GPU.
+    compile: bool = True  # --no-compile: on a GPU, train the network as it is.
+    half: bool = True  # --no-half: train in float32 where the device computes bfloat16.
     controls: ControlsConfig = ControlsConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
 
@@ -181,7 +188,7 @@ class _Learning:
         """Says what the minutes will give, by a trial of seconds. TerrellaError where that is nothing."""
         schedule = self.schedule
         self.progress("A trial of some seconds: what does this machine manage?")
-        pace = time_environment(world, self.config.seed, TrainConfig(device=self.config.device))
+        pace = time_environment(world, self.config.seed, self._training)
         if pace is None:
             return
         recorded_s = max(schedule.left_s(RECORDING), FEW_FRAMES / pace.frames_per_s)
@@ -240,11 +247,15 @@ class _Learning:
 
     def _train(self, report: Report) -> dict[str, object]:
         folder = self.schedule.folder
-        hours = self.schedule.share_s[TRAINING] / 3600
-        config = TrainConfig(folder.name, steps=ENDLESS, hours=hours, seed=self.config.seed, save_every_s=SAVE_EVERY_S)
-        config = replace(config, strip_every_s=self._strip_s, device=self.config.device)
-        facts = train_video(folder / RECORDING, folder / "run", config, report, self._paced)
+        facts = train_video(folder / RECORDING, folder / "run", self._training, report, self._paced, self.progress)
         return {"world": facts["world"], "steps": facts["step"]}
+
+    @property
+    def _training(self) -> TrainConfig:
+        config, hours = self.config, self.schedule.share_s[TRAINING] / 3600
+        chosen = {name: getattr(config, name) for name in ("seed", "device", "preset", "batch", "compile", "half")}
+        times = {"hours": hours, "save_every_s": SAVE_EVERY_S, "strip_every_s": self._strip_s}
+        return TrainConfig(self.schedule.folder.name, steps=ENDLESS, **times, **chosen)
 
     def _paced(self, steps: int) -> None:
         if line := slower(steps, self.schedule.minutes):

@@ -105,6 +105,7 @@ def load_named(
 ) -> World:
     """A world by name. Only learned worlds have a device, a memory and a faster way of drawing."""
     from .. import library
+    from ..learn.devices import describe_device
 
     options: dict[str, Any] = {**remembering, **({"fast": True} if fast else {})}
     if not library.is_truth(name):
@@ -115,18 +116,6 @@ def load_named(
     if fast:
         progress(f"{name}: {world.spec.card.get('fast')}")
     return world
-
-
-def describe_device(name: str) -> str:
-    """A device of `device_of` in words: what it is, its memory in GiB or its threads."""
-    import torch
-
-    device = torch.device(name)
-    if device.type == "cuda":
-        facts = torch.cuda.get_device_properties(device)
-        return f"{name} ({facts.name}, {facts.total_memory / 2**30:.0f} GiB)"
-    threads = torch.get_num_threads()
-    return f"{name} ({threads} thread{'s'[: threads > 1]})" if device.type == "cpu" else name
 
 
 def device_of(name: str) -> str:

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..learn.devices import describe_device
 from ..learn.recipes import latent, video
+from .opening import device_of
 from .progress import Progress, Report, silent, stage
 from .results import jsonable
 
@@ -32,7 +34,7 @@ def train_video(
     """Trains a playable world on the recording `data`, a folder or an address. The run is in the folder `out`; `load(out)` opens
     its world. The same call continues where an earlier one was stopped."""
     settings = config or video.TrainConfig()
-    return run_recipe(lambda report: video.train_video(data, out, settings, report), progress, run=out)
+    return run_recipe(lambda report: video.train_video(data, out, settings, report, say=progress), progress, run=out)
 
 
 def train_latent(
@@ -41,6 +43,7 @@ def train_latent(
     """Trains a latent world on the recording `data`, with pictures, state vectors or both: it predicts a latent instead of pixels.
     The same call continues where an earlier one was stopped."""
     settings = config or latent.LatentTraining()
+    progress(f"It trains on {describe_device(device_of(settings.device))}.")
     return run_recipe(lambda report: latent.train_latent(data, out, settings, report), progress, run=out)
 
 

@@ -9,7 +9,9 @@ from torch import nn
 
 from ...act.actor_network import ActorConfig, ActorNetwork, ObservationEncoder, mlp, symexp
 from ..imagination import ImaginedRollouts
-from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
+from ..learners import Ema, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 from .outcome import two_hot
 
 BINS, REACH = 63, 10.0  # of the critic, evenly spaced in symlog: up to about 22,000

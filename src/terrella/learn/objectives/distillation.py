@@ -9,8 +9,11 @@ import torch
 
 from ...worlds.generator import Conditioning, UNet
 from ..batches import Batch, generate_now
+from ..devices import half_precision
+from ..learners import Ema, Learner, adamw
 from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, truth_losses, weighted_total
-from ..trainer import Ema, Learner, Loss, TrainStep, adamw, half_precision
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 
 class Matching:

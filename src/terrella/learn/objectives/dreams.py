@@ -17,7 +17,8 @@ from ...worlds.generator import encode_depth
 from ...worlds.learned import LearnedWorld
 from ..batches import Batch, as_generated, encode_rgb
 from ..recording import Recording
-from ..trainer import Loss, TrainStep
+from ..train_step import TrainStep
+from ..trainer import Loss
 from .distillation import Student
 
 CONTEXT = 10  # recorded frames before a rollout

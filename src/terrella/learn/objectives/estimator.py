@@ -15,8 +15,10 @@ from ...space.camera import yaw
 from ...space.estimator import Estimator, EstimatorConfig, normalise
 from ...space.floorplan import Box
 from ..feeds import RandomBatches
+from ..learners import adamw, warmup_cosine
 from ..recording import Recording
-from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import CPU, Loss, Run, Trainer
 
 DRIFT = 64  # steps over which odometry is integrated to measure drift
 

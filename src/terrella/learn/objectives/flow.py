@@ -7,8 +7,10 @@ import torch
 
 from ...worlds.generator import Conditioning, UNet, channels_last
 from ..batches import Batch, generate_now
+from ..learners import Ema, adamw, warmup_cosine
 from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, frame_losses, weighted_total
-from ..trainer import Ema, Loss, TrainStep, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 CRITIC_AHEAD = 200  # steps that the critic trains before the generator uses it
 

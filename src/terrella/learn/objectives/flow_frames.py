@@ -12,9 +12,12 @@ from ...space.matching import scroll_index
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
+from ..devices import Compiled
+from ..learners import Ema, warmup_cosine
 from ..moves import StitchedEpisodes
 from ..muon import muon
-from ..trainer import Ema, Loss, TrainStep, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
 CHANGED = 8  # difference of 255 by which a pixel changes
@@ -53,7 +56,7 @@ class FlowClipMaker:
         rgb, action = np.asarray(clips["rgb"]), np.asarray(clips["action"], np.float32)
         one, other = rgb[:, self.slots - 1 : -1], rgb[:, self.slots :]
         differs = ((np.maximum(one, other) - np.minimum(one, other)).max(-1) > CHANGED).mean((2, 3)).max(1)
-        weight = 0.2 + 1.0 * (differs > 0.005) + 2.0 * (differs > 0.2)
+        weight = preference(differs)
         picks = now.rng.choice(len(rgb), self.batch, replace=len(rgb) < self.batch, p=weight / weight.sum())
         picks = now.rng.permutation(picks)
         frames = torch.from_numpy(rgb[picks]).permute(0, 1, 4, 2, 3).contiguous()
@@ -67,16 +70,27 @@ class FlowClipMaker:
         """Of rows [B, rollout]."""
         if self.stitched is None:
             return None
-        size, place = (self.over.shape[0], self.over.shape[1]), self.stitched.place
-        after = torch.from_numpy(rows)
+        size, after = (self.over.shape[0], self.over.shape[1]), torch.from_numpy(rows)
         known = self.stitched.memory(after.flatten(), size).unflatten(0, after.shape)
-        move = place[after - 1] - place[after]
-        x = torch.arange(size[1]) - move[..., :1]
-        y = torch.arange(size[0]) - move[..., 1:]
-        shown = ((x >= 0) & (x < size[1]))[:, :, None] & ((y >= 0) & (y < size[0]))[..., None]  # by the last frame
-        kind = torch.from_numpy(now.rng.random(len(rows)))[:, None, None, None]
-        seen = ~self.over & (kind >= BLIND) & (shown | (kind < BLIND + WHOLE))
-        return known * seen[:, :, None]
+        kind = torch.from_numpy(now.rng.random(len(rows)))
+        return known * memory_shown(self.stitched.place, after, self.over, kind)[:, :, None]
+
+
+def preference(changed):
+    """The sampling weight of clips by the largest part of the pixels that a step of them changes."""
+    return 0.2 + 1.0 * (changed > 0.005) + 2.0 * (changed > 0.2)
+
+
+def memory_shown(place: torch.Tensor, rows: torch.Tensor, over: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
+    """Which pixels of the pictures of `rows` int64 [B, T] training may remember, bool [B, T, H, W], by kind [B], uniform in 0..1:
+    none, all, or what the picture before showed. place, over: see StitchedEpisodes and FlowClipMaker."""
+    height, width = over.shape
+    move = place[rows - 1] - place[rows]
+    x = torch.arange(width, device=rows.device) - move[..., :1]
+    y = torch.arange(height, device=rows.device) - move[..., 1:]
+    shown = ((x >= 0) & (x < width))[:, :, None] & ((y >= 0) & (y < height))[..., None]  # by the last frame
+    kind = kind[:, None, None, None]
+    return ~over & (kind >= BLIND) & (shown | (kind < BLIND + WHOLE))
 
 
 class FlowFrames:
@@ -86,10 +100,15 @@ class FlowFrames:
     def __init__(self, network: FlowNetwork, learning_rate: float, rollout: int, stress: float):
         self.stress, self.losses_per_batch = stress, rollout  # gradient steps per batch
         self.generator = channels_last(network)
+        self._encode, self._clean = self.generator.encode, self.generator.clean
         self.smooth = Ema(self.generator, 0.995)
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         rate = warmup_cosine(learning_rate, WARMUP // rollout, 0.02)
         self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
+
+    def compile(self) -> None:
+        """Has both halves of the network compiled at their first call."""
+        self._encode, self._clean = Compiled(self.generator.encode), Compiled(self.generator.clean)
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
         slots = self.generator.config.slots
@@ -119,8 +138,8 @@ class FlowFrames:
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
         frames = frames + level * now.randn(*frames.shape)
         with now.half():
-            seen = network.encode(frames, context, scroll, memory)
-            draft = network.clean(seen, seen.base, torch.zeros(batch, device=now.device), memory)
+            seen = self._encode(frames, context, scroll, memory)
+            draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device), memory)
         parts = {"draft": self._error(draft, clean, base, changes)}
         if now.share < DRAFTS:
             return Loss("generator", parts["draft"], parts)
@@ -128,7 +147,7 @@ class FlowFrames:
         share = t[:, None, None, None]
         noisy = (1 - share) * now.randn(*clean.shape) + share * clean
         with now.half():
-            drawn = network.clean(seen, noisy, t, memory)
+            drawn = self._clean(seen, noisy, t, memory)
         parts["drawn"] = self._error(drawn, clean, base, changes)
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
 

@@ -10,7 +10,9 @@ import torch
 
 from ...act.distributions import SquashedGaussian
 from ...act.goal_network import GoalNetwork
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 QUANTILE = 0.2  # of the steps to a goal, which estimates a short way to it
 

@@ -8,7 +8,9 @@ import torch.nn.functional as F
 
 from ...act.imitation_network import AXES, ImitationNetwork
 from ...core.spec import BUTTONS
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 FORGOTTEN = (
     0.5  # probability that the own actions are hidden, so that the policy is no copy of them (de Haan et al. 2019)

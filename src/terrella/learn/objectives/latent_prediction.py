@@ -15,7 +15,9 @@ from torch import nn
 
 from ...worlds.controls import AXES, BUTTONS, Controls
 from ...worlds.latent_network import LatentConfig, LatentNetwork, Looks
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 from .outcome import two_hot
 
 KNOTS, REACH = 17, 3.0  # points at which characteristic functions are compared, from 0 to REACH

@@ -9,8 +9,10 @@ import torch.nn.functional as F
 
 from ...core.errors import DatasetError
 from ...space.lifting.network import LayerCodes, Lifter, LifterConfig
+from ..learners import Ema, warmup_cosine
 from ..muon import muon
-from ..trainer import Ema, Loss, TrainStep, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 Batch = Mapping[str, torch.Tensor]
 SCALES = (1, 2, 4, 8)  # pixels between which depth is compared

@@ -16,8 +16,10 @@ from ...space.keyframes import Keyframes
 from ...worlds.body import Motion
 from ...worlds.config import MotionConfig
 from ..feeds import RandomBatches
+from ..learners import Learner
 from ..recording import Recording
-from ..trainer import CPU, Learner, Loss, Run, Trainer, TrainStep
+from ..train_step import TrainStep
+from ..trainer import CPU, Loss, Run, Trainer
 
 _WINDOWS, _LENGTH = 512, 24  # trajectories, and steps of each, on which the body is fitted
 _BATCH, _RARE = 512, 64  # steps of a batch, and how many of them are last steps of episodes

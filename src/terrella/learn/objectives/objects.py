@@ -27,8 +27,10 @@ from ...worlds.objects import (
     update_billboards,
 )
 from ..feeds import RandomBatches
+from ..learners import adamw, warmup_cosine
 from ..recording import INSTANCES, OBJECTS, Recording
-from ..trainer import CPU, Loss, Report, Run, Trainer, TrainStep, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import CPU, Loss, Report, Run, Trainer
 
 CLEAR, LARGE = (
     0.0008,

@@ -12,7 +12,9 @@ import torch.nn.functional as F
 from ...data import ClipCache
 from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
 from ..feeds import RandomBatches
-from ..trainer import Learner, Loss, Run, Trainer, TrainStep, warmup_cosine
+from ..learners import Learner, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss, Run, Trainer
 
 LENGTH = 8  # steps of a clip
 FOLLOWED = 0.5  # the part of the clips that go on with their own vitals, as in play, and learn to correct them

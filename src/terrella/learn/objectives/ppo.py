@@ -7,7 +7,9 @@ from torch import nn
 
 from ...act.actor_network import ActorNetwork
 from ..imagination import ImaginedRollouts
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 from .actor_critic import Critic, ReturnConfig, lambda_returns, step_weights
 from .outcome import two_hot
 

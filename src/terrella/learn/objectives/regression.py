@@ -5,7 +5,9 @@ from collections.abc import Iterator
 import torch
 from torch import nn
 
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 BATCH = 256
 BAGGING = 0.75  # the part of the rows from which a member learns

@@ -11,8 +11,10 @@ from ...space.matching import clear_index, edge_shares
 from ...worlds.generator import context_thumbnail
 from ...worlds.scroll import Scroll, least_off
 from ..feeds import RandomBatches
+from ..learners import adamw, warmup_cosine
 from ..recording import Recording
-from ..trainer import Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss, Run, Trainer
 
 STEPS, BATCH, LENGTH = 600, 24, 8  # training steps, clips of each, and steps of a clip, which are predicted in turn
 ROLLED_OUT = (

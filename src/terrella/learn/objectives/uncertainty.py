@@ -36,9 +36,11 @@ from ...worlds.uncertainty import (
 )
 from ..calibration import isotonic
 from ..feeds import RandomBatches
+from ..learners import adamw, warmup_cosine
 from ..recording import Recording
 from ..run_folder import resume_file
-from ..trainer import CPU, Loss, Run, Trainer, TrainStep, adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import CPU, Loss, Run, Trainer
 from .drift import ROLLOUTS, ceiling_of, drift_frames, drift_horizon, fit_drift
 
 MEMORY, HOLES, NONE, LONE = "memory", "holes", "no memory", "lone picture"

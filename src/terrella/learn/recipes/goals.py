@@ -17,6 +17,7 @@ from ..feeds import RandomBatches
 from ..latent_validation import observation_at
 from ..objectives.goals import GoalReaching, Trajectories, action_error
 from ..recording import Recording
+from ..sized_feed import SizedFeed
 from ..trainer import Report, Run, Trainer
 from .policy import device_of
 
@@ -51,7 +52,7 @@ def train_goals(
     opened = _opened(world, recording, report)
     latents = _latents(world, opened, report)
     seen, held = (_trajectories(opened, latents, which, config.farthest) for which in (opened.seen, opened.held_out))
-    feed = RandomBatches(lambda now: seen.sample(config.batch, now.rng))
+    feed = SizedFeed(lambda size: RandomBatches(lambda now: seen.sample(size, now.rng)), config.batch)
     trainer = Trainer(run, STAGE, feed, GoalReaching(network, config.learning_rate), config.steps)
     card = {"what": f"A goal-conditioned policy in the latents of {world.spec.name}", "learned_in": name}
 

@@ -23,10 +23,12 @@ from ...data.channels import ESTIMATES
 from ...data.training.cache import array_for
 from ..copycat import copycat
 from ..demonstrations import DemonstrationRows
+from ..devices import device_named
 from ..feeds import RandomBatches
 from ..objectives.imitation import BehaviourCloning
 from ..recording import Recording
-from ..trainer import Report, Run, Trainer, device_named
+from ..sized_feed import SizedFeed
+from ..trainer import Report, Run, Trainer
 from .policy import DEFAULT_MINUTES, ENDLESS, Practice
 
 STAGE = "imitation"
@@ -90,7 +92,7 @@ def train_imitation(
     rows = relabel(DemonstrationRows.of(opened, config, run.device))
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
     objective = BehaviourCloning(network, practice.learning_rate)
-    feed = RandomBatches(lambda now: rows.sample(batch, now.rng))
+    feed = SizedFeed(lambda size: RandomBatches(lambda now: rows.sample(size, now.rng)), batch)
     trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
     trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
     card = {"what": f"A policy that imitates {recording}", "learned_from": str(recording), "sees": list(sees)}

@@ -16,10 +16,12 @@ from ...core.errors import DatasetError, TrainingError
 from ...core.spec import BUTTONS
 from ..calibration import Isotonic, calibration_error
 from ..demonstrations import DemonstrationRows
+from ..devices import device_named
 from ..feeds import RandomBatches
 from ..objectives.imitation import BehaviourCloning, condition
 from ..recording import Recording
-from ..trainer import Report, Run, Trainer, device_named
+from ..sized_feed import SizedFeed
+from ..trainer import Report, Run, Trainer
 from .imitation import Imitation, config_of
 
 STAGE, SUBFOLDER = "inverse", "inverse"
@@ -87,7 +89,7 @@ def train_inverse(
     learned, kept = (rows.of_episodes(part) for part in (order[back:], order[:back]))
     network.fit_normalization(learned.sample(4096, np.random.default_rng(0)).seen)
     objective = BehaviourCloning(network, config.learning_rate, STAGE)
-    feed = RandomBatches(lambda now: learned.sample(config.batch, now.rng))
+    feed = SizedFeed(lambda size: RandomBatches(lambda now: learned.sample(size, now.rng)), config.batch)
     trainer = Trainer(run, STAGE, feed, objective, config.steps)
     trainer.train(lambda: None)
     network.eval()

@@ -18,13 +18,15 @@ from ...worlds.folder import save_latent, with_saved_keys
 from ...worlds.latent import LatentWorld
 from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
+from ..devices import device_named
 from ..feeds import ClipStream
 from ..latent_validation import ARMS, calibrate, encode_rows, rollout_frames, validate
 from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, set_scale
 from ..objectives.outcome import levels
 from ..recording import Recording
+from ..sized_feed import SizedFeed
 from ..strips import write_lines
-from ..trainer import Paced, Report, Run, Trainer, device_named
+from ..trainer import Paced, Report, Run, Trainer
 
 STAGE = "latent"
 SIDE, COARSE = 64, 16  # pixels: the longer side at most, and of what sides are multiples
@@ -229,11 +231,12 @@ class _Training:
         batch = min(config.batch or (32 if self.sees_pictures else 128), clips)
         names = [name for name in ("action", "reward", "done") if getattr(recording.cache, name) is not None]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
-        settings = ClipsConfig(config.history + steps, names, batch, seed=config.seed, episodes=recording.seen)
+        settings = ClipsConfig(config.history + steps, names, seed=config.seed, episodes=recording.seen)
         make = lambda rows, now: latent_clips(rows, self.controls, self.network.config, now.device)  # noqa: E731
         objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps)
         total = config.steps or (2500 if self.sees_pictures else 4000)
-        trainer = Trainer(self.run, STAGE, ClipStream(Clips(recording.cache, settings), make), objective, total)
+        clips = lambda size: ClipStream(Clips(recording.cache, replace(settings, batch=size)), make)  # noqa: E731
+        trainer = Trainer(self.run, STAGE, SizedFeed(clips, batch, min(2, batch)), objective, total)
         done = (self.run.out / "world" / WORLD_FILE).exists() and "validation" in trainer.facts
         if not trainer.finished:
             trainer.facts.pop("validation", None)

@@ -8,13 +8,14 @@ import torch
 
 from ...core.errors import DatasetError, TrainingError
 from ...data import ClipCache, Clips, ClipsConfig
+from ..devices import device_named
 from ..feeds import ClipStream
 from ..objectives.latent_actions import LatentActionsObjective
 from ..objectives.latent_model import LatentModel
 from ..recording import Recording
 from ..run_folder import load_run, resume_file
 from ..strips import write_lines
-from ..trainer import Report, Run, Trainer, device_named
+from ..trainer import Report, Run, Trainer
 
 STAGE = "codes"
 WHY = "latent actions are learned from pictures"

@@ -12,12 +12,14 @@ from ...core.errors import TrainingError
 from ...worlds.folder import save_world
 from ...worlds.learned import LearnedWorld
 from ..feeds import RandomBatches
+from ..learners import hold_then_decay
 from ..objectives.distillation import Student
 from ..objectives.dreams import DreamRollouts, DreamsObjective, dream_starts
 from ..paired import Paired, fingerprint, open_paired
 from ..recording import Box
+from ..sized_feed import SizedFeed
 from ..strips import draw_strip
-from ..trainer import Report, Run, Trainer, hold_then_decay
+from ..trainer import Report, Run, Trainer
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: Dis
     )
     student = Student("student", teacher.generator, config.flow_steps, rate, 0.0, weights, teacher.generator)
     run = _run(pair, out, config, report)
-    trainer = Trainer(run, "distil", pair.feed(config.batch, student.dream), student, config.steps)
+    feed = SizedFeed(lambda size: pair.feed(size, student.dream), config.batch)
+    trainer = Trainer(run, "distil", feed, student, config.steps)
     about = f"{steps} to {config.flow_steps} steps a frame, {{}} updates"
     return _trained(pair, run, trainer, student, lambda step: {"distilled": about.format(step)})
 
@@ -106,8 +109,8 @@ def train_dreams(
     student = Student("generator", world.generator, world.config.steps, rate, 0.9, weights, likely)
     dreams = DreamsObjective(student, config.horizon, pair.feed(config.batch).batch)
     run = _run(pair, out, config, report, **more)
-    feed = RandomBatches(lambda now: DreamRollouts(world, pair.recording, config.horizon, config.batch, now))
-    trainer = Trainer(run, "dreams", feed, dreams, config.steps)
+    batches = lambda size: RandomBatches(lambda now: DreamRollouts(world, pair.recording, config.horizon, size, now))  # noqa: E731
+    trainer = Trainer(run, "dreams", SizedFeed(batches, config.batch), dreams, config.steps)
     about = lambda step: {"dreams": f"{step * config.batch:,} of {config.horizon} frames"}  # noqa: E731
     return _trained(pair, run, trainer, student, about)
 

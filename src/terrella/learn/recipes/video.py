@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,10 +16,13 @@ from ...data import Dataset
 from ...worlds.folder import save_world
 from ...worlds.learned import LearnedWorld
 from ..budget import Stage
+from ..devices import describe_device, device_named, free_bytes
 from ..objectives.uncertainty import discard_uncertainty, uncertainty_seconds
+from ..presets import STEPS, TrainingPlan
 from ..recording import Recording, joined_cameras
+from ..sized_feed import SizedFeed
 from ..strips import draw_strip
-from ..trainer import Paced, Report, Run, Trainer, device_named
+from ..trainer import Paced, Report, Run, Trainer
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
 from .video_flat import FlowRecipe
@@ -30,11 +34,18 @@ WHY = "a world is learned from frames and actions (`terrella train latent-action
 
 
 def train_video(
-    data: str | Path, out: str | Path, config: TrainConfig, report: Report, paced: Paced | None = None
+    data: str | Path,
+    out: str | Path,
+    config: TrainConfig,
+    report: Report,
+    paced: Paced | None = None,
+    say: Callable[[str], object] = lambda line: None,
 ) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
-    `Trainer.train`, of the generator's steps."""
-    return _Training(_recipe(data, out, config, report), paced).learn()
+    `Trainer.train`, of the generator's steps. `say` is given a sentence of what is about to be trained."""
+    recipe = _recipe(data, out, config, report)
+    say(recipe.plan.sentence(describe_device(str(recipe.plan.device)), recipe.channels))
+    return _Training(recipe, paced).learn()
 
 
 class TrainingPace(NamedTuple):
@@ -55,7 +66,7 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
     where that is faster: on busy cores threads wait for each other."""
     began = time.monotonic()
     with TemporaryDirectory() as folder:
-        recipe = _recipe(data, folder, replace(config, hours=0.0), lambda *_: None)
+        recipe = _recipe(data, folder, replace(config, hours=0.0), lambda *_: None, config.minutes)
         setup_s, trained = time.monotonic() - began, _Training(recipe)
         rest = sum(stage.share or 0.0 for stage in trained.stages)
         many = torch.get_num_threads()
@@ -69,20 +80,26 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
         return TrainingPace(setup_s, pace[best], 1 - rest)
 
 
-def _recipe(data: str | Path, out: str | Path, config: TrainConfig, report: Report) -> VideoRecipe:
-    """What is learned from the recording. TrainingError or DatasetError for settings and recordings that do not fit."""
+def _recipe(
+    data: str | Path, out: str | Path, config: TrainConfig, report: Report, minutes: float | None = None
+) -> VideoRecipe:
+    """What is learned from the recording, by a preset for `minutes`, by default those of the settings. TrainingError or
+    DatasetError for settings and recordings that do not fit."""
     if config.size and any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
+    config = replace(config, steps=config.steps or STEPS["cuda" if device.type == "cuda" else "cpu"])
     dataset = Dataset(data)
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
-    run = Run.of(out, config, report, device, ("hours", "learning_rate"), **facts)
-    run.saved_facts("flow")
+    run = Run.of(out, config, report, device, ("hours", "learning_rate", "compile", "half"), **facts)
+    settings = {"batch": config.batch, "compiled": config.compile, "half": config.half}
+    plan = TrainingPlan.of(config.preset, device, minutes or config.minutes, free_bytes(device), **settings)
+    plan = plan.kept(run.saved_facts("flow"))
     joined = joined_cameras(dataset, config.geometry)
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY, joined=joined)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
-    return (PosedRecipe if video.geometry else FlowRecipe)(run, recording, config, video)
+    return (PosedRecipe if video.geometry else FlowRecipe)(run, recording, config, video, plan)
 
 
 class _Training:
@@ -105,14 +122,14 @@ class _Training:
         return {"world": str(self.run.out / "world"), **self.trainer.summary, **self.parts.facts, **senses}
 
     def new_trainer(self) -> Trainer:
-        usual = self.config.batch or (64 if self.run.device.type == "cuda" else 8)
-        self.batch: int = (self.run.saved_facts("flow") or {}).get(
-            "batch", usual
-        )  # smaller after running out of memory
-        feed = self.recipe.feed(self.batch)
-        objective = self.recipe.objective
-        strides = objective.losses_per_batch
-        return Trainer(self.run, "flow", feed, objective, self.config.steps, strides=strides)
+        recipe, plan = self.recipe, self.recipe.plan
+        feed, strides = SizedFeed(recipe.feed, plan.batch), recipe.objective.losses_per_batch
+        assert self.config.steps is not None
+        trainer = Trainer(self.run, "flow", feed, recipe.objective, self.config.steps, strides=strides)
+        trainer.facts["preset"] = plan.preset.name
+        if not plan.half:
+            trainer.facts["float32"] = True
+        return trainer
 
     def _train_generator(self) -> None:
         self.trainer = trainer = self.new_trainer()
@@ -120,25 +137,7 @@ class _Training:
         if not trainer.finished:
             discard_uncertainty(self.run.out)  # it was fitted to the errors of an earlier generator
             trainer.facts.pop("senses", None)
-        self._train_within_memory()
-
-    def _train_within_memory(self) -> None:
-        """Trains to the end. Whenever the device runs out of memory, the batch is halved and training goes on from there."""
-        trainer = self.trainer
-        while True:
-            try:
-                return trainer.train(self._save_with_strip, self.paced)
-            except torch.cuda.OutOfMemoryError:
-                if self.batch == 1:
-                    raise TrainingError(
-                        f"{self.run.device} has too little memory for one clip; train smaller pictures (--size) or --channels, "
-                        "or on the CPU (--device cpu)."
-                    ) from None
-            self.batch //= 2
-            trainer.facts["batch"], trainer.feed = self.batch, self.recipe.feed(self.batch)
-            torch.cuda.empty_cache()
-            line = f"{self.run.device} ran out of memory: the batch is halved to {self.batch}, and training goes on"
-            self.run.report(min(trainer.share, 1.0), 1.0, line)
+        trainer.train(self._save_with_strip, self.paced)
 
     def _limit_s(self) -> float:
         """Seconds of the generator's training: what the preparations left of the hours, less what the uncertainty will take by a

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from ...core.errors import DatasetError
 from ...worlds.config import VideoConfig
 from ...worlds.objects import ROWS
+from ..presets import PresetName
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, has_channel
 
 WIDTHS = (32, 56, 88, 128)  # channels of a U-Net
@@ -20,8 +21,14 @@ class TrainConfig:
     # --no-geometry: learn from frames and actions alone, although the recording has depth and poses.
     geometry: bool = True
     # Channels of the generator at 1/2, 1/4, 1/8, ... of the size (without depth at 1/4, 1/8 and 1/16). Default: 32 56 88 128, and
-    # without depth 64 112 160.
+    # without depth those of the preset.
     channels: tuple[int, ...] = ()
+    # Size of a generator without depth: small has 2.4M parameters, medium 11M, large 23M, huge 43M. Default: small on a CPU; on a
+    # GPU medium from 5 minutes, large from an hour, huge from four, as far as its memory allows.
+    preset: PresetName = "auto"
+    # --no-compile: on a GPU, run the network of a world without depth as it is.
+    compile: bool = True
+    half: bool = True  # --no-half: compute in float32 where the device computes bfloat16.
     frames: int = 4  # Number of past frames that a world without geometry sees.
     # Training steps of the model that predicts reward, termination and vitals.
     outcome_steps: int = 1500
@@ -33,8 +40,9 @@ class TrainConfig:
     # Flow steps a frame (without depth 3, unless more than 1 are given). With more than one the whole flow from noise to frame is
     # learned, so that a frame is a sample, not a mean. A world with depth can then be the teacher of `train distil`.
     flow_steps: int = 1
-    # Training steps of the generator. Training ends after these or after --hours, whichever comes first.
-    steps: int = 8000
+    # Training steps of the generator. Training ends after these or after --hours, whichever comes first. Default: 8000 on a CPU,
+    # 60000 on a GPU.
+    steps: int | None = None
     # Hours of training, of all stages together, earlier runs included; learning rates decay over them.
     hours: float = 24.0
     # Frames per step. Default: 8 on a CPU, 64 on a GPU.
@@ -55,6 +63,11 @@ class TrainConfig:
     strip_every_s: float = 300.0  # Seconds between pictures of truth and prediction.
     seed: int = 0  # Random seed.
     device: str = "auto"  # cpu, cuda or auto.
+
+    @property
+    def minutes(self) -> float | None:
+        """Minutes of training; None where no --hours are given."""
+        return None if self.hours == TrainConfig.hours else 60 * self.hours
 
 
 def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:

@@ -18,13 +18,17 @@ from ...worlds.frame_history import FrameHistory, StartClips
 from ...worlds.learned import LearnedWorld
 from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
+from ..device_clips import ROOM, DeviceClips, DeviceGrounds, bytes_of
+from ..devices import free_bytes
 from ..feeds import ClipStream, clips_of, fitting_rollout
 from ..moves import Scrolling, changed_pixels, mosaics, stitch_episodes
 from ..objectives.flow_frames import FlowClipMaker, FlowFrames
 from ..objectives.scroll import learn_scroll
+from ..presets import GIB, TrainingPlan
 from ..recording import Recording
 from ..run_folder import resume_file
-from ..trainer import Feed, Run, Trainer
+from ..sized_feed import Feed
+from ..trainer import Run, Trainer
 from .video_config import TrainConfig
 from .video_parts import VideoParts
 
@@ -42,14 +46,15 @@ class FlowRecipe:
     """A flow network: each frame is a sample of what may follow the last frames, with the mosaic as memory where pictures
     scroll."""
 
-    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig, plan: TrainingPlan):
+        self.channels = config.channels
         if config.keep_out is not None:
             raise DatasetError(
                 f"without depth and poses no part of the map of {recording.name} can be kept out; drop --keep-out."
             )
         self.parts = VideoParts(run, recording.require_rows(), config, video)
         self.video = self.parts.video
-        widths = config.channels or FlowConfig.channels
+        widths = config.channels or plan.preset.channels
         if len(widths) != 3 or any(width % 8 for width in widths):
             raise TrainingError("--channels: a flow network has three, each a multiple of 8, as 64 112 160.")
         if self.video.slots < 2:
@@ -68,15 +73,36 @@ class FlowRecipe:
             stress_of(recording, network, config.seed),
         )
         self.objective = FlowFrames(network, config.learning_rate or 6e-3, rollout, stress)
+        if plan.compiled:
+            self.objective.compile()
         self.stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
         self.ground = None if self.stitched is None else joined(list(self.stitched.grounds.values()))
         self.starts: StartClips | None = None  # made once
+        self.held, where = self._on_device(free_bytes(run.device))
+        self.plan = replace(plan, recording=where)
+
+    def _on_device(self, free_bytes: float) -> tuple[DeviceClips | None, str]:
+        """The recording on a GPU with as many bytes free, if there is room for it, and a sentence of that."""
+        device, recording = self.parts.run.device, self.parts.recording
+        if device.type != "cuda":
+            return None, ""
+        size = bytes_of(recording, self.stitched)
+        if size > ROOM * free_bytes:
+            return (
+                None,
+                f"the recording ({size / GIB:.2g} GiB) takes more than half of its memory: clips come from the CPU",
+            )
+        grounds = None if self.stitched is None else DeviceGrounds(self.stitched, self.over, device)
+        held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
+        return held, f"the recording on it ({size / GIB:.2g} GiB)"
 
     def feed(self, batch: int) -> Feed:
-        """Clips chosen from three times as many, preferring those that change more."""
+        """Clips chosen from three times as many, preferring those that change more; on a GPU from all, which lie there."""
         recording, slots = self.parts.recording, self.video.slots
         controls = recording.controls or Controls.buttons(self.video.actions)
         length, seed = slots + self.objective.losses_per_batch, self.parts.config.seed
+        if self.held is not None:
+            return self.held.sized(2 * batch)
         maker = FlowClipMaker(controls, slots, 2 * batch, self.stitched, self.over)
         return ClipStream(clips_of(recording, length, 3 * maker.batch, self.video, seed), maker)
 

@@ -18,19 +18,26 @@ from ..budget import Stage
 from ..objectives.flow import Flow
 from ..objectives.flow_frames import FlowFrames
 from ..objectives.outcome import Happenings, OutcomeObjective, learn_outcome
+from ..presets import TrainingPlan
 from ..recording import Recording
-from ..trainer import Feed, Run, Trainer
+from ..sized_feed import Feed
+from ..trainer import Run, Trainer
 from .video_config import TrainConfig
 
 
 class VideoRecipe(Protocol):
     """What differs between worlds with depth and poses and worlds of frames alone.
 
+    channels: of the generator, where they are not those of a preset.
     preparations: the stages before the generator. world: a copy, on the CPU, of the world as it now is.
     """
 
+    plan: TrainingPlan
+
     @property
     def parts(self) -> VideoParts: ...
+    @property
+    def channels(self) -> tuple[int, ...]: ...
     @property
     def objective(self) -> Flow | FlowFrames: ...
     def feed(self, batch: int) -> Feed: ...

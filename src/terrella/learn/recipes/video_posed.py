@@ -18,8 +18,10 @@ from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
 from ..objectives.objects import learn_objects
+from ..presets import TrainingPlan
 from ..recording import Recording, choose_keyframes, open_views
-from ..trainer import Feed, Run, Trainer
+from ..sized_feed import Feed
+from ..trainer import Run, Trainer
 from .video_config import TrainConfig
 from .video_parts import VideoParts
 
@@ -27,7 +29,8 @@ from .video_parts import VideoParts
 class PosedRecipe:
     """A generator over a memory of keyframes, a body that slides along walls and, where they were recorded, objects."""
 
-    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
+    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig, plan: TrainingPlan):
+        self.plan, self.channels = replace(plan, compiled=False, lacking=""), video.channels
         if config.keep_out is not None:
             recording = replace(recording, usable=Recording.of(recording.cache, recording.seen, config.keep_out).usable)
         recording = recording.require_rows()

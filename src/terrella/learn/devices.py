@@ -1,0 +1,82 @@
+"""Where training computes: the device by its name, its free memory, half precision, and the cores of a busy CPU."""
+
+import math
+import os
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from ..core.errors import TrainingError
+
+BUSY = 1.5  # processes that run, for each core, from which a machine is busy
+
+
+def device_named(name: str) -> torch.device:
+    """cpu, cuda, or auto (CUDA if there is one, else the CPU). TrainingError for a device that PyTorch does not have here."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+        return device
+    except (RuntimeError, AssertionError, NotImplementedError, ModuleNotFoundError):
+        raise TrainingError(f"--device {name}: PyTorch has no such device here; say cpu, cuda or auto.") from None
+
+
+def describe_device(name: str) -> str:
+    """A device in words: what it is, its memory in GiB or its threads."""
+    device = torch.device(name)
+    if device.type == "cuda":
+        facts = torch.cuda.get_device_properties(device)
+        return f"{name} ({facts.name}, {facts.total_memory / 2**30:.0f} GiB)"
+    threads = torch.get_num_threads()
+    return f"{name} ({threads} thread{'s'[: threads > 1]})" if device.type == "cpu" else name
+
+
+def free_bytes(device: torch.device) -> float:
+    """Memory of a GPU that is free; infinite for other devices, of which PyTorch does not say."""
+    return float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else math.inf
+
+
+def half_precision(device: torch.device) -> torch.autocast:
+    """bfloat16 where the device computes it natively."""
+    native = half_is_native(device)
+    return torch.autocast(device.type if native else "cpu", torch.bfloat16, enabled=native)
+
+
+def half_is_native(device: torch.device) -> bool:
+    avx512 = device.type == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX512"
+    return device.type == "cuda" or avx512 and _cpu_has_bf16()
+
+
+def _cpu_has_bf16() -> bool:
+    """Whether in hardware: emulated by oneDNN it is 2.7 times slower than float32."""
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+
+
+def yield_cores() -> None:
+    """Sets PyTorch to one thread where other processes use all cores: its threads would wait for each other."""
+    if os.getloadavg()[0] > BUSY * (os.cpu_count() or 1):
+        torch.set_num_threads(1)
+
+
+class Compiled:
+    """A function of tensors, compiled at its first call. Where the compiler fails, it runs as it is, which a warning says."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self._function, self._fast = function, torch.compile(function, dynamic=False)
+
+    def __call__(self, *given: Any) -> Any:
+        if self._fast is None:
+            return self._function(*given)
+        try:
+            return self._fast(*given)
+        except torch.OutOfMemoryError:
+            raise
+        except Exception as error:  # compilers fail in many ways
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            warnings.warn(f"torch.compile fails here ({reason}): training goes on uncompiled.", stacklevel=2)
+        self._fast = None
+        return self._function(*given)

@@ -1,0 +1,40 @@
+"""A training step: its number, device and randomness."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from .devices import half_precision
+
+
+@dataclass(frozen=True)
+class TrainStep:
+    """One training step. share: the part of the training that lies before it, by steps or by time, whichever is more;
+    rng, noise: its randomness, seeded by (seed, step); precise: networks compute in float32."""
+
+    step: int
+    share: float
+    device: torch.device
+    rng: np.random.Generator
+    noise: torch.Generator = field(repr=False)
+    precise: bool = False
+
+    def randn(self, *shape: int) -> torch.Tensor:
+        """Standard normal noise on the device; a GPU draws it itself, so that nothing is copied to it."""
+        return torch.randn(*shape, generator=self.noise, device=self._drawn_on).to(self.device)
+
+    def rand(self, *shape: int) -> torch.Tensor:
+        """Uniform noise in 0..1, likewise."""
+        return torch.rand(*shape, generator=self.noise, device=self._drawn_on).to(self.device)
+
+    @property
+    def _drawn_on(self) -> torch.device:
+        return self.device if self.device.type == "meta" else self.noise.device
+
+    def half(self) -> torch.autocast | nullcontext:
+        """A context in which networks compute in half precision, where that is native."""
+        return nullcontext() if self.precise else half_precision(self.device)

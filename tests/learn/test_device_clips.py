@@ -1,0 +1,72 @@
+"""Clips on a device: what the host cuts, cut where the recording lies; and a training step that waits for nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from tests.learn.stopping import quiet
+from tests.learn.test_flow_frames import MOVES, SIZE, recording, scrolling, step  # noqa: F401
+from tests.learn.test_trainer import Settings
+
+from terrella.core.dispatch import Dispatches
+from terrella.learn import trainer as module
+from terrella.learn.device_clips import DeviceClips, DeviceGrounds
+from terrella.learn.moves import stitch_episodes
+from terrella.learn.objectives.flow_frames import DRAFTS, FlowFrames
+from terrella.learn.trainer import Run, Trainer
+from terrella.worlds.flow import FlowConfig, FlowNetwork
+
+OVER, SLOTS, ROLLOUT = torch.zeros(SIZE, dtype=torch.bool), 4, 4
+
+
+def clips_on(device: str, recording, moves=MOVES) -> DeviceClips:  # noqa: F811
+    grounds = DeviceGrounds(stitch_episodes(recording, moves, OVER), OVER, torch.device(device))
+    return DeviceClips(recording, SLOTS, ROLLOUT, torch.device(device), grounds).sized(40)
+
+
+def test_clips_are_rows_of_the_recording_that_follow_each_other(recording):  # noqa: F811
+    clips = clips_on("cpu", recording)
+    batch, picks = clips.batch(step()), None
+    assert batch.frames.shape == (40, SLOTS + ROLLOUT, 3, *SIZE) and batch.actions.shape[:2] == (40, SLOTS + ROLLOUT)
+    whole = recording.rgb(np.arange(recording.cache.length))
+    lone = 0
+    for frames in batch.frames:
+        picks = [int((whole.int() - frame.int()).abs().sum((1, 2, 3)).argmin()) for frame in frames]
+        assert all(torch.equal(whole[pick], frame) for pick, frame in zip(picks, frames))
+        lone += torch.equal(frames[0], frames[SLOTS - 1]) and torch.equal(frames[1], frames[SLOTS - 1])
+    assert lone < 20, "some begin with one frame repeated"
+    other = clips.batch(step(number=1))
+    assert not torch.equal(other.frames, batch.frames) and torch.equal(clips.batch(step()).frames, batch.frames)
+
+
+def test_the_memory_is_that_of_the_host(recording):  # noqa: F811
+    stitched = stitch_episodes(recording, MOVES, OVER)
+    grounds = DeviceGrounds(stitched, OVER, torch.device("cpu"))
+    rows = torch.tensor([[5, 6, 7], [40, 41, 42]])
+    rows = torch.cat([rows, rows + recording.cache.episodes[recording.held_out[0]][0]]) if recording.held_out else rows
+    known = stitched.memory(rows.flatten(), SIZE).unflatten(0, rows.shape)
+    assert known.any() and torch.equal(grounds.memory(rows, torch.full((len(rows),), 0.5)), known), "all of it"
+    assert not grounds.memory(rows, torch.zeros(len(rows))).any(), "nothing"
+    some = grounds.memory(rows, torch.ones(len(rows)))
+    assert 0 < int((some > 0).sum()) < int((known > 0).sum()), "what the picture before showed"
+
+
+def test_a_training_step_on_a_device_waits_for_nothing_and_copies_nothing(recording, tmp_path, monkeypatch):  # noqa: F811
+    """From the clips to the new weights, and what is logged."""
+    lists, tensor_of = [], torch.tensor
+    network = FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + SLOTS, len(MOVES) - 1, (8, 8, 8)))
+    objective = FlowFrames(network, 1e-3, ROLLOUT, 2.0)
+    run = replace(Run.of(tmp_path, Settings(), quiet), device=torch.device("meta"))
+    trainer = Trainer(run, "flow", clips_on("meta", recording), objective, 100)
+    monkeypatch.setattr(torch, "tensor", lambda *given, **kinds: lists.append(given) or tensor_of(*given, **kinds))
+    trainer._step(0)  # makes the optimiser's state, and constants
+    monkeypatch.setattr(Trainer, "share", DRAFTS + 0.1)
+    monkeypatch.setattr(module, "LOG_EVERY", 20)
+    trainer._step(200)
+    lists.clear()
+    with Dispatches("meta") as count:
+        parts = trainer._step(201)
+    assert set(parts) == {"draft", "drawn"} and len(parts["draft"]) == ROLLOUT
+    assert count.waits == 0 and count.crossings == 0 and not lists, count.by_site.most_common(9)

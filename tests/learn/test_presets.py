@@ -1,0 +1,87 @@
+"""Presets: how large a network is by device, memory and minutes, and what is said of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tests.learn.small import FLAT
+from tests.learn.stopping import quiet
+
+from terrella.core.errors import TrainingError
+from terrella.learn.devices import Compiled
+from terrella.learn.presets import GIB, PRESETS, TrainingPlan
+from terrella.learn.recipes.video import train_video
+from terrella.worlds.flow import FlowConfig, FlowNetwork
+from terrella.worlds.folder import load_world
+
+CPU, CARD = torch.device("cpu"), torch.device("cuda")
+
+
+def plan(device=CARD, minutes=None, free_gib=math.inf, name="auto", **settings) -> TrainingPlan:
+    return TrainingPlan.of(name, device, minutes, free_gib * GIB, **settings)
+
+
+def test_the_presets_have_as_many_parameters_as_they_say():
+    for preset in PRESETS:
+        with torch.device("meta"):
+            network = FlowNetwork(FlowConfig((64, 64), 4, 52, channels=preset.channels))
+        assert sum(weight.numel() for weight in network.parameters()) / 1e6 == pytest.approx(preset.millions, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("device", "minutes", "name"),
+    [(CPU, 600, "small"), (CARD, 2, "small"), (CARD, 10, "medium"), (CARD, None, "medium"), (CARD, 90, "large"),
+     (CARD, 1000, "huge")],
+)  # fmt: skip
+def test_the_device_and_the_minutes_choose(device, minutes, name):
+    assert plan(device, minutes).preset.name == name
+
+
+def test_a_card_too_small_has_the_next_smaller_and_says_so():
+    made = plan(minutes=90, free_gib=5.5)
+    assert made.preset.name == "medium"
+    assert made.sentence("cuda (a card, 6 GiB)") == (
+        "cuda has 5.5 GiB free, and the preset large takes 7: the next smaller that fits is trained, medium. "
+        "cuda (a card, 6 GiB), 90 min: the preset medium, 11M parameters (--preset), batches of 64 (--batch), "
+        "compiled (--no-compile), bfloat16 (--no-half)."
+    )
+    assert plan(free_gib=0.5).preset.name == "small", "the smallest is tried anyhow"
+
+
+def test_options_refuse_it():
+    made = plan(minutes=10, name="huge", batch=16, compiled=False, half=False)
+    assert made.sentence("cuda") == "cuda, 10 min: the preset huge, 43M parameters (--preset), batches of 16 (--batch)."
+    assert plan(CPU).sentence("cpu", (8, 8, 8)) == "cpu: channels 8 8 8, batches of 8 (--batch)."
+
+
+def test_a_run_that_was_begun_keeps_its_size():
+    assert plan(minutes=600).kept({"preset": "medium"}).preset.name == "medium"
+    assert plan(minutes=600).kept({}).preset.name == "small", "before there were presets"
+    assert plan(minutes=600).kept(None).preset.name == "huge"
+
+
+def test_a_world_is_trained_by_its_preset_which_is_said(corridor, tmp_path):
+    lines: list[str] = []
+    config = replace(FLAT, channels=(), steps=2, batch=1, uncertainty_frames=0, outcome_steps=1)
+    train_video(corridor, tmp_path, config, quiet, say=lines.append)
+    assert len(lines) == 1 and "the preset small, 2.4M parameters (--preset), batches of 1 (--batch)" in lines[0]
+    assert load_world(tmp_path / "world").generator.config.channels == (64, 112, 160)
+    with pytest.raises(TrainingError, match="preset auto, not large"):
+        train_video(corridor, tmp_path, replace(config, preset="large"), quiet)
+
+
+def test_without_a_compiler_it_computes_as_it_is_and_says_so(monkeypatch):
+    def broken(function, **options):
+        def run(*given):
+            raise RuntimeError("no compiler is installed")
+
+        return run
+
+    monkeypatch.setattr(torch, "compile", broken)
+    double = Compiled(lambda x: 2 * x)
+    with pytest.warns(UserWarning, match=r"torch.compile fails here \(no compiler is installed\): training goes on"):
+        assert double(3) == 6
+    assert double(4) == 8
