@@ -32,6 +32,7 @@ COMMANDS = [
 @pytest.mark.parametrize(("page", "snippet"), SNIPPETS)
 def test_the_python_of_the_guides_runs(page, snippet, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path / "logs"))
     if "stable_baselines3" in snippet:
         pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is missing: pip install 'terrella[sb3]'")
     exec(compile(snippet, page, "exec"), {"__name__": "guide"})

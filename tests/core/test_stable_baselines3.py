@@ -47,7 +47,8 @@ def test_a_time_limit_is_a_truncation(film):
     assert ends[1][3][0]["terminal_observation"].tolist() == [2.0] and ends[1][0].tolist() == [[0.0]]
 
 
-def test_its_algorithms_and_wrappers_run(film):
+def test_its_algorithms_and_wrappers_run(film, tmp_path, monkeypatch):
+    monkeypatch.setenv("SB3_LOGDIR", str(tmp_path))
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 

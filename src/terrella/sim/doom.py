@@ -11,6 +11,7 @@ import re
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -280,6 +281,12 @@ def _named(scenario: str) -> tuple[str, tuple[str, ...]]:
     return name, tuple(part.strip().upper() for part in maps.split(",") if part.strip())
 
 
+@cache
+def _settings_folder(process: int) -> tempfile.TemporaryDirectory[str]:
+    """Where ViZDoom writes its settings: a folder for each process, which goes when that ends."""
+    return tempfile.TemporaryDirectory(prefix=f"terrella-vizdoom-{process}-", ignore_cleanup_errors=True)
+
+
 def _open_game(
     config: DoomConfig, scenario: str, maps: tuple[str, ...]
 ) -> tuple[vizdoom.DoomGame, tuple[str, ...], bool]:
@@ -291,7 +298,7 @@ def _open_game(
     more = [name for name in MORE_BUTTONS if getattr(button, name) in game.get_available_buttons()]
     alive = bool(maps) or variable.HEALTH in game.get_available_game_variables()
     buttons = (*BUTTONS, *more)
-    game.set_doom_config_path(os.path.join(tempfile.gettempdir(), f"terrella-vizdoom-{os.getpid()}.ini"))
+    game.set_doom_config_path(os.path.join(_settings_folder(os.getpid()).name, "settings.ini"))
     game.set_mode(vizdoom.Mode.PLAYER)
     game.set_screen_resolution(vizdoom.ScreenResolution.RES_512X384)
     game.set_screen_format(vizdoom.ScreenFormat.RGB24)
