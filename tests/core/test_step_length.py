@@ -87,6 +87,14 @@ def model(timestep: float) -> SimpleNamespace:
         (Env(None, _timeStep=1 / 240, _actionRepeat=8), 1 / 30, "its _timeStep x _actionRepeat"),
         (Env(25, sim=SimpleNamespace(dt=0.04)), 0.04, "its sim.dt"),
         (Env("12.5 Hz"), 0.08, "its render_fps"),
+        (Env("30000/1001"), 1001 / 30000, "its render_fps"),
+        (Env("30/0"), None, "no rate is declared; its render_fps, '30/0', is no rate"),
+        (
+            Env(15, config={"policy_frequency": 5, "simulation_frequency": 15}),  # as highway-env
+            0.2,
+            "its config.policy_frequency; by its render_fps it would be 15",
+        ),
+        (Env(50, _env=SimpleNamespace(control_timestep=lambda: 0.02)), 0.02, "its _env.control_timestep"),  # as shimmy
         (Env(np.array([15])), 1 / 15, "its render_fps"),
         (Env("fast"), None, "no rate is declared; its render_fps, 'fast', is no rate"),
         (Env(0), None, "no rate is declared; its render_fps, 0, is no rate"),

@@ -155,3 +155,22 @@ def test_bounds_that_do_not_fit_are_refused(tmp_path):
         saved(tmp_path / "a.npz", {"observations": STATE, "actions": ACTION, **bounds})
         with pytest.raises(DatasetError, match="does not fit its 12 rows"):
             open_source(tmp_path / "a.npz")
+
+
+def test_a_file_of_one_step_is_refused_and_pictures_of_floats_and_pickles_are_named(tmp_path):
+    picture = np.zeros((40, 48, 3), np.uint8)
+    for number in (7, 8):  # as CALVIN keeps them
+        saved(
+            tmp_path / f"episode_{number}.npz",
+            {"actions": np.zeros(7), "robot_obs": np.zeros(15), "rgb_static": picture},
+        )
+    with pytest.raises(DatasetError, match=r"a single step \('rgb_static' is one picture\); stack"):
+        open_source(tmp_path)
+    (tmp_path / "f").mkdir()
+    bright = np.full((ROWS, 40, 48, 3), 0.5, np.float32)
+    saved(tmp_path / "f" / "a.npz", {"observations": STATE, "actions": ACTION, "terminals": LAST, "eye": bright})
+    assert any("'eye' is kept as numbers; pictures are bytes" in note for note in open_source(tmp_path / "f").notes)
+    ragged = np.array([STATE, STATE[:3]], object)
+    np.savez(tmp_path / "f" / "a.npz", observations=ragged, actions=ACTION)
+    with pytest.raises(DatasetError, match="'observations' is left out: it is a pickle, which is not opened"):
+        open_source(tmp_path / "f")

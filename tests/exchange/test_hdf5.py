@@ -471,3 +471,14 @@ def test_a_reward_that_is_one_number_is_robomimics_flat_array(tmp_path):
         assert file["data"].attrs["total"] == 2 and file["data/demo_0"].attrs["num_samples"] == 2
     (found,) = hdf5.read(tmp_path / "a.hdf5").takes()
     assert rows.rows_of(found, "it").steps == 2
+
+
+def test_arrays_beside_the_observations_of_a_demo_are_kept_or_named(tmp_path):
+    """As LIBERO's robot_states."""
+    path = robomimic_file(tmp_path / "a.hdf5", next_obs=False)
+    with h5py.File(path, "a") as file:
+        for name, n in (("demo_10", 4), ("demo_2", 3)):
+            file[f"data/{name}/robot_states"], file[f"data/{name}/seed"] = np.arange(2.0 * n).reshape(n, 2), np.zeros(1)
+    source = hdf5.read(path)
+    assert [take.readings["info.robot_states"].values[-1].tolist() for take in source.takes()] == [[4, 5], [6, 7]]
+    assert "info.seed" not in source.sensors and any("'seed' is left out" in note for note in source.notes)

@@ -161,6 +161,8 @@ def test_the_form_in_which_pictures_are_drawn_is_named():
         in describe(GymnasiumWorld(gives(render=GREY / 255)).spec)[0]
     )
     assert "pictures of 24x32 (--size)" in describe(GymnasiumWorld(Plain).spec)[0]
+    several = GymnasiumWorld(gives(render={"mask": GREY, "front": RGB, "wrist": RGB})).spec
+    assert "drawn as 'front' of a dictionary of mask, front, wrist up to 255" in describe(several)[0]
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,12 @@ import ast
 import inspect
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from fractions import Fraction
 from operator import attrgetter
 from textwrap import dedent
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium
@@ -32,6 +34,7 @@ _COUNTS = (
 )  # fmt: skip
 _HOLDS = ("skip", "frameskip", "actionrepeat")  # of wrappers, without underscores
 _FRAMES = ("render_fps", "video.frames_per_second", "fps")
+_OWNERS = ("_env", "config", "cfg")  # parts of the bare environment, or its settings, that may hold the control rate
 _UNIT = re.compile(r"\s*(fps|hz)\s*$", re.IGNORECASE)
 _TRIAL_STEPS, _LONGEST_S = 3, 60.0
 
@@ -75,7 +78,7 @@ def _trial(env: gymnasium.Env) -> Any:
 
 def _measured(env: gymnasium.Env) -> dict[str, float]:
     """{clock: seconds that each step advances it}; {} where no clock is one."""
-    clocks = {name: now for name in (*_SIMULATORS, *_CLOCKS) if isinstance(now := _at(env, name), float)}
+    clocks = {name: now for name in (*_SIMULATORS, *_CLOCKS) if isinstance(now := _at(env.unwrapped, name), float)}
     if not clocks:
         return {}
     times = {name: [now] for name, now in clocks.items()}
@@ -84,7 +87,7 @@ def _measured(env: gymnasium.Env) -> dict[str, float]:
         for _ in range(_TRIAL_STEPS):
             _, _, terminated, truncated, _ = env.step(action)
             for name, seen in times.items():
-                seen.append(float(_at(env, name)))
+                seen.append(float(_at(env.unwrapped, name)))
             if terminated or truncated:
                 break
     except Exception:  # foreign code: its own errors are reported where it is stepped in earnest
@@ -109,14 +112,19 @@ def _held(env: gymnasium.Env) -> tuple[float, str]:
 
 
 def _control(env: gymnasium.Env) -> dict[str, float]:
-    rates = {name: 1 / rate for name, rate in _positive(env, _RATES)}
-    return dict(list({**rates, **dict(_positive(env, _PERIODS))}.items())[:1])
+    parts = {f"{name}.": part for name in _OWNERS if (part := getattr(env.unwrapped, name, None)) is not None}
+    for prefix, part in {"": env.unwrapped, **parts}.items():
+        owner = SimpleNamespace(**{str(key): it for key, it in part.items()}) if isinstance(part, Mapping) else part
+        rates = {name: 1 / rate for name, rate in _positive(owner, _RATES)}
+        for name, length in {**rates, **dict(_positive(owner, _PERIODS))}.items():
+            return {f"{prefix}{name}": length}
+    return {}
 
 
 def _stepped(env: gymnasium.Env, frame: dict[str, float]) -> dict[str, float]:
     """{what declares the step: seconds, ...}, the step first, from time steps, their number, and the length of a frame."""
-    count_name, count = next(iter(_positive(env, _COUNTS)), ("", 1.0))
-    steps, physics = dict(_positive(env, _STEPS)), dict(_positive(env, _PHYSICS))
+    count_name, count = next(iter(_positive(env.unwrapped, _COUNTS)), ("", 1.0))
+    steps, physics = dict(_positive(env.unwrapped, _STEPS)), dict(_positive(env.unwrapped, _PHYSICS))
     frame_s = next(iter(frame.values()), None)
     lengths: dict[str, float] = {}
     for name, length in {**steps, **physics}.items():
@@ -178,28 +186,28 @@ def _frame(env: gymnasium.Env) -> tuple[dict[str, float], list[str]]:
     return {}, []
 
 
-def _positive(env: gymnasium.Env, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
+def _positive(owner: Any, names: tuple[str, ...]) -> Iterator[tuple[str, float]]:
     """(name, number) of the attributes that are positive numbers; frame_skip may be spelled _frameSkip or FRAME_SKIP."""
-    spelled = {name.replace("_", "").lower(): name for name in reversed(dir(env.unwrapped))}
+    spelled = {name.replace("_", "").lower(): name for name in reversed(dir(owner))}
     for name in names:
         own = spelled.get(name.replace("_", ""), name)
-        if number := _number(_at(env, own)):
+        if number := _number(_at(owner, own)):
             yield own, number
 
 
-def _at(env: gymnasium.Env, path: str) -> Any:
+def _at(owner: Any, path: str) -> Any:
     """The value at a path of attributes; the result, where it is a method; None where there is none."""
     try:
-        value = attrgetter(path)(env.unwrapped)
+        value = attrgetter(path)(owner)
         return value() if callable(value) else value
     except Exception:  # foreign code, whose answer is optional
         return None
 
 
 def _number(value: Any) -> float | None:
-    """A positive finite number, or text that spells one ("30", "30 fps"); else None."""
+    """A positive finite number, or text that spells one ("30", "30 fps", "30000/1001"); else None."""
     try:
-        number = float(_UNIT.sub("", value)) if isinstance(value, str) else single_number(value, "")
-    except (TerrellaError, ValueError):
+        number = float(Fraction(_UNIT.sub("", value))) if isinstance(value, str) else single_number(value, "")
+    except (TerrellaError, ValueError, ZeroDivisionError):
         return None
     return number if not isinstance(value, bool) and 0 < number < math.inf else None

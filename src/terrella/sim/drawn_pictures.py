@@ -49,9 +49,10 @@ def _array(value: Any) -> tuple[np.ndarray, str]:
     """(one picture as an array, what it was)."""
     if isinstance(value, Mapping):
         keys = [key for key in _PICTURE_KEYS if key in value] or list(value)
-        return _first([value[key] for key in keys], f"a dictionary of {', '.join(map(str, value))}")
-    if isinstance(value, tuple) and (pictures := [one for one in value if _is_picture(one)]):
-        return _first(pictures, f"a tuple of {len(value)}")
+        return _first({repr(key): value[key] for key in keys}, f"of a dictionary of {', '.join(map(str, value))}")
+    if isinstance(value, tuple) and any(map(_is_picture, value)):
+        pictures = {f"number {n}": one for n, one in enumerate(value) if _is_picture(one)}
+        return _first(pictures, f"of a tuple of {len(value)}")
     if isinstance(value, list) and value and _is_picture(value[-1]):
         return _array(value[-1])[0], f"a list of {type(value[-1]).__name__}"
     if isinstance(value, Image.Image):
@@ -69,13 +70,14 @@ def _array(value: Any) -> tuple[np.ndarray, str]:
     return array, f"{kind}{array.dtype} {list(array.shape)}"
 
 
-def _first(values: Any, what: str) -> tuple[np.ndarray, str]:
-    """The first of some pictures that has colours, else the first."""
-    arrays = [_array(value)[0] for value in values if value is not None]
+def _first(values: Mapping[str, Any], what: str) -> tuple[np.ndarray, str]:
+    """The first of some pictures that has colours, else the first, and which it is."""
+    arrays = {key: _array(value)[0] for key, value in values.items() if value is not None}
     if not arrays:
-        raise TerrellaError(f"its render() gives {what}, without a picture")
-    coloured = (array for array in arrays if array.ndim == 3 and (array.shape[0] == 3 or array.shape[2] in (3, 4)))
-    return next(coloured, arrays[0]), what
+        raise TerrellaError(f"its render() gives none {what} that is a picture")
+    coloured = (at for at, it in arrays.items() if it.ndim == 3 and (it.shape[0] == 3 or it.shape[2] in (3, 4)))
+    chosen = next(coloured, next(iter(arrays)))
+    return arrays[chosen], f"{chosen} {what}"
 
 
 def _is_picture(value: Any) -> bool:

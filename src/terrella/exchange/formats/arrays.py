@@ -141,8 +141,19 @@ def columns(
     for place, array in arrays.items():
         sensor = guess(place, array.shape[1:], array.dtype) if array.is_numeric else None
         if sensor is None:
-            notes.append(f"{what} '{spelled(place)}' is left out: it is not a known array of numbers.")
+            why = (
+                "a pickle, which is not opened"
+                if array.dtype.kind == "O" and not array.is_text
+                else "not a known array of numbers"
+            )
+            notes.append(f"{what} '{spelled(place)}' is left out: it is {why}.")
             continue
+        if (
+            array.dtype.kind == "f"
+            and len(array.shape) == 4
+            and rows.picture_layout(array.shape[1:], np.uint8) in ("hwc", "chw")
+        ):
+            notes.append(f"{what} '{spelled(place)}' is kept as numbers; pictures are bytes of 0 to 255 (uint8).")
         own = (described or {}).get(place)
         if own is not None and own.dtype == sensor.dtype:
             own = rows.stored_as(own, array.shape[1:])

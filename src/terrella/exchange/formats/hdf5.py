@@ -54,7 +54,7 @@ def _layout_of(path: Path) -> str:
         contents = ", ".join(sorted(names, key=rows.natural)[:12]) or "nothing"
     raise DatasetError(
         f"{path} is none of the known layouts (robomimic: data/demo_0; Counter-Strike: frame_0_x, frame_0_y; D4RL: "
-        f"observations, actions); it holds {contents}."
+        f"observations, actions); it holds {contents}. Copy its episodes to data/demo_0, data/demo_1, ... with actions and obs."
     )
 
 

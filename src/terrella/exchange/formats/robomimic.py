@@ -23,6 +23,7 @@ _NAMES = {
     "states": "info.states",
 }
 _PLACES = {name: (key,) for key, name in _NAMES.items() if key != "obs"}
+_ACTIONS = ("actions",)
 _FLAGS = ("dones", "truncated")
 _TOP = ("data", "mask")
 
@@ -71,11 +72,14 @@ def read(path: Path, fps: float | None) -> Source:
 
 def _headers(demo: hdf5_file.Group) -> dict[arrays.Place, arrays.Array]:
     """The arrays of a demo but for texts. robomimic leaves `states` empty where there is no simulator."""
-    return {
+    stored = {
         place: it
         for place, it in hdf5_file.headers(hdf5_file.all_datasets(demo)).items()
         if place[0] != "next_obs" and not (place[0] != "obs" and 0 in it.shape) and not it.is_text
     }
+    steps = stored[_ACTIONS].shape[:1] if _ACTIONS in stored else ()
+    rowless = (place for place, it in stored.items() if str(place[0]) not in _NAMES and it.shape[:1] != steps)
+    return stored | {place: replace(stored[place], shape=()) for place in rowless}  # named as left out
 
 
 def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
@@ -89,7 +93,10 @@ def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
 def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     key = str(place[-1])
     if place[0] != "obs" or len(place) < 2:
-        return arrays.sensor_at(_NAMES, place, shape, dtype) if len(place) == 1 else None
+        known = len(place) == 1 and place[0] in _NAMES
+        return arrays.sensor_at(
+            _NAMES if known else {place[0]: rows.INFO}, place if known else (place[0], *place), shape, dtype
+        )
     if key.endswith("_depth") and dtype == np.float32 and len(shape) in (2, 3) and shape[2:] in ((), (1,)):
         rows.check_size(shape[0], shape[1], f"'{key}'")
         name = f"{rows.DEPTH}.{rows.clean(key.removesuffix('_depth'))}"

@@ -40,13 +40,17 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     about = rows.read_json((path if path.is_dir() else path.parent) / ABOUT, missing={})
     described = rows.sensors_described(about, str(path / ABOUT)) if about else {}
     own = {_place(key): described[name] for name, key in _keys(described).items()}
+    if len(files) > 1:
+        _refuse_single_steps(files[0])
     every = [flat.split(_columns(file), str(file), bool(about)) for file in files]
     stored = arrays.union(episodes.stored for episodes in every)
     bare = flat.is_bare(stored)
     sensors, notes = arrays.columns(stored, partial(flat.guess, bare), "the key", own)
     if not any(rows.role_of(sensor.name) == rows.OBSERVATION for sensor in sensors.values()):
         keys = ", ".join(map(arrays.spelled, every[0].stored)) or "nothing"
-        raise DatasetError(f"{files[0]} has no observations; it holds {keys}, not obs or obs.NAME. {' '.join(notes)}")
+        raise DatasetError(
+            f"{files[0]} has no observations; it holds {keys}, none of them numbers called obs or obs.NAME. {' '.join(notes)}"
+        )
     notes += [*([flat.BARE] * bare), *(every[0].notes if len(files) == 1 else ())]
 
     def takes(rate: float) -> Iterator[Take]:
@@ -54,6 +58,16 @@ def read(path: str | Path, fps: float | None = None) -> Source:
             yield from _takes(file, sensors, rate, bool(about))
 
     return arrays.source("the folder", path.stem, sensors, takes, fps=fps, about=about, notes=notes)
+
+
+def _refuse_single_steps(path: Path) -> None:
+    """DatasetError where a file, one of many, holds one step of an episode, as CALVIN's do."""
+    for place, array in _arrays(path).items():
+        if len(array.shape) == 3 and rows.picture_layout(array.shape, array.dtype) == "hwc":
+            raise DatasetError(
+                f"{path} holds a single step ('{arrays.spelled(place)}' is one picture); stack the steps of each episode into "
+                "arrays with a row for each step, save them as one .npz, and name the folder of these."
+            )
 
 
 def _columns(path: Path) -> dict[Place, Array]:
