@@ -143,6 +143,16 @@ def test_a_pose_at_rest_is_held(tmp_path, servo, key, rest):
     assert moved_by(world, world.spec.idle)[0] == pytest.approx(home, abs=0.05)
 
 
+def test_a_rest_beyond_the_files_limits_is_named_and_the_keyframe_home_is_the_rest(tmp_path):
+    servo = '<position joint="swing" kp="100" kv="1" ctrlrange="-1 1"/>'
+    world = world_of(tmp_path, ARM.format("", "", servo, HOME.format("-1.57 0", ' ctrl="-1.57"')))
+    assert world.spec.idle == (-1.0,)
+    assert "beyond the file's limits, which hold: swing -1.57 of -1 to 1" in world.spec.card["notes"][0]
+    keys = '<keyframe><key name="down" qpos="1 0"/><key name="Home" qpos="2 0"/></keyframe>'
+    world = world_of(tmp_path, ARM.format("", "", '<position joint="swing" kp="9"/>', keys))
+    assert world.spec.idle == (2.0,) and float(world.layout.home[0]) == 2
+
+
 def test_added_servos_do_not_take_the_defaults_of_motors(tmp_path):
     defaults = '<default><motor gear="5e-4" ctrlrange="-1 1" forcerange="-1e-3 1e-3"/><general gear="5e-4"/></default>'
     text = BODY.format("").replace("<worldbody>", f"{defaults}<worldbody>")
@@ -191,6 +201,10 @@ def test_of_joints_that_follow_one_another_one_is_driven(tmp_path):
     assert world.spec.action_names == ("a", "d")  # c is held
     end = moved_by(world, [0.5, -0.5])
     assert end == pytest.approx([0.5, 0.5, 0.3, -0.5], abs=0.02)
+    curve = '<joint joint1="b" joint2="a" polycoef="0 0 .5 0 0"/><joint joint1="d" joint2="c"/>'
+    world = world_of(tmp_path, f"<mujoco><worldbody>{tree}</worldbody><equality>{curve}</equality></mujoco>")
+    assert world.spec.action_names == ("a", "c")
+    assert moved_by(world, [1.2, 0.4]) == pytest.approx([1.2, 0.72, 0.4, 0.4], abs=0.02)
     loose = links.replace('/><joint joint1="b"', ' active="false"/><joint active="false" joint1="b"')
     world = world_of(tmp_path, f"<mujoco><worldbody>{tree}</worldbody><equality>{loose}</equality></mujoco>")
     assert world.spec.action_names == ("a", "b", "d")

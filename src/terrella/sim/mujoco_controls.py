@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.errors import TerrellaError
-from .mujoco_model import BALL, FREE, SLIDE, mujoco
+from .mujoco_model import BALL, FREE, SLIDE, home_key, mujoco
 
 POSITION, VELOCITY, FORCE, MUSCLE = "position", "velocity", "force", "muscle"
 TURN_RAD, SLIDE_M = float(np.pi), 1.0  # reach of a position servo to either side, where nothing limits it
@@ -19,13 +19,14 @@ _TENDON, _SITE = int(mujoco.mjtTrn.mjTRN_TENDON), int(mujoco.mjtTrn.mjTRN_SITE)
 @dataclass(frozen=True)
 class ControlLimits:
     """low, high and rest: float64 [nu], in the units of the controls; act: activations at rest, float64 [na]; chosen: the limits
-    that the file does not state, as text."""
+    that the file does not state, as text; clipped: the controls at rest that are outside of the file's limits, as text."""
 
     low: np.ndarray
     high: np.ndarray
     rest: np.ndarray
     act: np.ndarray
     chosen: tuple[str, ...]
+    clipped: tuple[str, ...]
 
 
 def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
@@ -39,7 +40,8 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
     kinds = [kind_of_control(model, at) for at in range(model.nu)]
     servo = np.array([kind == POSITION for kind in kinds], bool)
     hold = np.array([_control_at(model, at, float(data.actuator_length[at])) for at in range(model.nu)]).reshape(-1)
-    rest = model.key_ctrl[0].copy() if model.nkey and model.key_ctrl[0].any() else np.where(servo, hold, 0.0)
+    key = home_key(model)
+    rest = np.where(servo, hold, 0.0) if key is None or not model.key_ctrl[key].any() else model.key_ctrl[key].copy()
     limits, chosen = model.actuator_ctrlrange.copy(), []
     for at in np.flatnonzero(~model.actuator_ctrllimited.astype(bool)).tolist():
         why = "its range, which the file does not enforce"
@@ -49,8 +51,10 @@ def controls_of(model: mujoco.MjModel, qpos: np.ndarray) -> ControlLimits:
         about = f"{control_name(model, at)} {low:.4g} to {high:.4g} {control_unit(model, at)}"
         chosen.append(f"{about.rstrip()} ({why})")
     low, high = limits[:, 0], limits[:, 1]
+    outside = np.flatnonzero((rest < low - 1e-6) | (rest > high + 1e-6)).tolist()
+    clipped = tuple(f"{control_name(model, at)} {rest[at]:.4g} of {low[at]:.4g} to {high[at]:.4g}" for at in outside)
     rest = np.clip(rest, low, high)
-    return ControlLimits(low, high, rest, _activations(model, kinds, rest, hold), tuple(chosen))
+    return ControlLimits(low, high, rest, _activations(model, kinds, rest, hold), tuple(chosen), clipped)
 
 
 def kind_of_control(model: mujoco.MjModel, at: int) -> str:
@@ -178,8 +182,8 @@ def _both_sides(reach: float) -> tuple[float, float]:
 
 def _activations(model: mujoco.MjModel, kinds: list[str], rest: np.ndarray, hold: np.ndarray) -> np.ndarray:
     """Activations at rest: the file's, or those at which servos hold their pose."""
-    if model.nkey and model.key_act[0].any():
-        return model.key_act[0].copy()
+    if (key := home_key(model)) is not None and model.key_act[key].any():
+        return model.key_act[key].copy()
     act = np.zeros(model.na)
     for at, first in enumerate(model.actuator_actadr):
         if first >= 0 and kinds[at] in (POSITION, VELOCITY):

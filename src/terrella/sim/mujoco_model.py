@@ -103,6 +103,9 @@ def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     groups = coupled_joints(model)
     driven = {joint for group in groups for joint in list(group)[1:]} | set(_held_joints(model, groups))
+    driven |= {
+        one for one, other, data in _joint_equalities(model) if other >= 0 and not data[1] and any(data[2:5])
+    }  # by a curve
     moves = {next(iter(group)): group for group in groups}
     inertias, weights = model.dof_M0[model.jnt_dofadr], _weights(model)
     loose = 1 / np.maximum(model.dof_invweight0[model.jnt_dofadr], 1e-9)  # inertias while all other joints are loose
@@ -120,6 +123,12 @@ def add_servos(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         servo.gear, servo.forcelimited = [1, 0, 0, 0, 0, 0], False  # the file's defaults may say otherwise
         servo.ctrllimited = bool(model.jnt_limited[at])
         servo.ctrlrange = model.jnt_range[at] if servo.ctrllimited else [0, 0]
+
+
+def home_key(model: mujoco.MjModel) -> int | None:
+    """The keyframe of the pose at rest: the one called home, else the first; None without keyframes."""
+    named = [at for at in range(model.nkey) if model.key(at).name.lower() == "home"]
+    return (named or range(model.nkey) or [None])[0]
 
 
 def _weights(model: mujoco.MjModel) -> list[float]:

@@ -26,7 +26,7 @@ from ..core.state import State
 from .mujoco_appearance import patterned
 from .mujoco_controls import ControlLimits, control_mode, control_name, control_unit, controls_of
 from .mujoco_lidar import SITE, Lidar
-from .mujoco_model import BALL, FREE, bare, compiled, complete, coupled_joints, mujoco, read
+from .mujoco_model import BALL, FREE, bare, compiled, complete, coupled_joints, home_key, mujoco, read
 from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_renderer import MujocoRenderer, lens
 from .mujoco_robots import Robot, robot_of
@@ -345,6 +345,8 @@ class MujocoWorld:
         notes = [f"camera {name} is no pinhole: it has no intrinsics" for name, one in lenses.items() if one is None]
         if chosen := self._controls.chosen:
             notes.append(f"limits of controls that the file does not state: {', '.join(chosen)}")
+        if clipped := self._controls.clipped:
+            notes.append(f"controls of the pose at rest beyond the file's limits, which hold: {', '.join(clipped)}")
         return Spec(
             name=self.name,
             **self._action_fields(),
@@ -391,13 +393,14 @@ def _cores() -> int:
 
 
 def _home(model: mujoco.MjModel, robot: Robot | None) -> np.ndarray:
-    """qpos [nq] at rest: the robot's pose, the file's first keyframe, or the reference pose with coupled joints in their places."""
-    qpos = model.key_qpos[0].copy() if model.nkey else model.qpos0.copy()
+    """qpos [nq] at rest: the robot's pose, the file's keyframe, or the reference pose with coupled joints in their places."""
+    key = home_key(model)
+    qpos = (model.qpos0 if key is None else model.key_qpos[key]).copy()
     if robot is not None and robot.pose:
         for at in range(model.njnt):
             if model.jnt_type[at] not in (int(FREE), int(BALL)):
                 qpos[model.jnt_qposadr[at]] = robot.rest(model.joint(at).name)
-    elif not model.nkey:
+    elif key is None:
         for joint, (_, offset) in ((joint, one) for group in coupled_joints(model) for joint, one in group.items()):
             qpos[model.jnt_qposadr[joint]] += offset
     if robot is not None and robot.height is not None:

@@ -151,7 +151,7 @@ def columns(
         if (
             array.dtype.kind == "f"
             and len(array.shape) == 4
-            and rows.picture_layout(array.shape[1:], np.uint8) in ("hwc", "chw")
+            and rows.picture_layout(array.shape[1:], "uint8") in ("hwc", "chw")
         ):
             notes.append(f"{what} '{spelled(place)}' is kept as numbers; pictures are bytes of 0 to 255 (uint8).")
         own = (described or {}).get(place)

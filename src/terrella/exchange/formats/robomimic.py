@@ -93,10 +93,9 @@ def _mask(file: hdf5_file.File) -> dict[str, list[str]]:
 def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     key = str(place[-1])
     if place[0] != "obs" or len(place) < 2:
-        known = len(place) == 1 and place[0] in _NAMES
-        return arrays.sensor_at(
-            _NAMES if known else {place[0]: rows.INFO}, place if known else (place[0], *place), shape, dtype
-        )
+        if place and place[0] not in _NAMES:
+            return rows.sensor_for(rows.INFO, arrays.joined(place), shape, dtype)
+        return arrays.sensor_at(_NAMES, place, shape, dtype) if len(place) == 1 else None
     if key.endswith("_depth") and dtype == np.float32 and len(shape) in (2, 3) and shape[2:] in ((), (1,)):
         rows.check_size(shape[0], shape[1], f"'{key}'")
         name = f"{rows.DEPTH}.{rows.clean(key.removesuffix('_depth'))}"
