@@ -152,7 +152,7 @@ def _run(given: list[str]) -> int:
     command: Callable[..., int | None] = getattr(import_module(f"{__name__}.{module}"), function)
     markers, words = (
         (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes),
-        [RENAMED.get(word, word) for word in rest],
+        rest if name == "space lift" else [RENAMED.get(word, word) for word in rest],  # its --eye is a height
     )
     if {"-h", "--help"} & set(words):
         with warnings.catch_warnings():

@@ -56,11 +56,11 @@ def build(
 def lift(
     picture: Annotated[Path, Positional, arg(metavar="PICTURE")], out: Path, config: LiftSpaceConfig, json: Json = False
 ) -> None:
-    """Make a place to walk in from one picture: a photograph, a drawing, a game's screenshot. A network estimates depth, lens, and
-    what lies behind edges.
+    """Make a place to walk in from one picture (a photograph, a drawing, a game's screenshot) or one panorama. A network estimates
+    depth, lens, and what lies behind edges.
 
     Args:
-        picture: The picture: JPEG, PNG, WebP, GIF (its first frame), TIFF or BMP.
+        picture: The picture: JPEG, PNG, WebP, GIF (its first frame), TIFF or BMP; or a panorama of 2:1.
         out: Folder of the world.
     """
     show(lift_space(picture, out, config), json, _viewing(out))

@@ -35,6 +35,7 @@ OPTIONS = {  # the files that each option is for
     "cell": (".glb",),
     "seconds": (".mp4",),
     "path": (".mp4",),
+    "at": (".png",),
 }
 FRAMES_PER_S = 30  # of a film
 MOST_FACES = 5_000_000
@@ -53,6 +54,8 @@ class ExportSpaceConfig:
     seconds: float = 8.0  # Duration of the film, in seconds.
     path: Path | None = None
     """Path of the film: a JSON list of [x, y, z, degrees]. Default: a look around from each start."""
+    at: tuple[float, float, float] | None = None
+    """Viewpoint of a panorama (.png): x y z in metres; its middle looks along x. Default: the first start and its heading."""
 
 
 def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResult:
@@ -94,7 +97,7 @@ def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[b
     with torch.no_grad():
         if suffix == ".glb":
             return _glb(world, config)
-        return _panorama(world) if suffix == ".png" else _film(world, config)
+        return _panorama(world, config.at) if suffix == ".png" else _film(world, config)
 
 
 def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
@@ -117,13 +120,18 @@ def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str,
     return encode_mesh(replace(mesh, vertices=mesh.vertices @ rot.T), world.name), facts
 
 
-def _panorama(world: SplatWorld, height: int = 1024) -> tuple[bytes, dict[str, Any]]:
-    """The view all around from the first start, equirectangular, twice as wide as high."""
-    seen = rasterise(world.gaussians, world.starts[:1], None, (height, 2 * height)).rgb[0]
+def _panorama(
+    world: SplatWorld, at: tuple[float, float, float] | None, height: int = 1024
+) -> tuple[bytes, dict[str, Any]]:
+    """The view all around from a point or the first start, equirectangular, twice as wide as high."""
+    pose = world.starts[0] if at is None else torch.tensor([*at, 1.0, 0.0, 0.0, 0.0])
+    if not bool(pose.isfinite().all()):
+        raise TerrellaError("--at takes three finite numbers: x y z in metres.")
+    seen = rasterise(world.gaussians, pose[None], None, (height, 2 * height)).rgb[0]
     picture = (seen.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0)
     buffer = io.BytesIO()
     Image.fromarray(picture.numpy()).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue(), {"size": [2 * height, height], "pose": [round(v, 3) for v in world.starts[0].tolist()]}
+    return buffer.getvalue(), {"size": [2 * height, height], "pose": [round(v, 3) for v in pose.tolist()]}
 
 
 def _film(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:

@@ -1,5 +1,6 @@
-"""One function for places: of words, of a layout, or of a picture."""
+"""One function for places: of words, of a layout, of a picture or of a panorama."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import TerrellaError
@@ -14,15 +15,22 @@ def generate_place(
     text: str | None = None,
     layout: str | Path | None = None,
     image: str | Path | None = None,
+    panorama: str | Path | None = None,
     config: BuildSpaceConfig | LiftSpaceConfig | None = None,
 ) -> SpaceResult:
     """Makes a place in the folder `out`, as `terrella space build` (of `text` or a `layout` file) and `terrella space lift` (of an
-    `image` file) do; `terrella.load(out)` opens it. TerrellaError unless exactly one of the three is given, with its own config."""
-    sources = [one for one in (text, layout, image) if one is not None]
-    if len(sources) != 1:
-        raise TerrellaError("give one of text=, layout= and image=.")
-    if image is not None and isinstance(config, LiftSpaceConfig | None):
-        return lift_space(Path(image), Path(out), config or LiftSpaceConfig())
-    if image is None and isinstance(config, BuildSpaceConfig | None):
+    `image` or `panorama` file) do; `terrella.load(out)` opens it. TerrellaError unless exactly one of them is given, with its own
+    config."""
+    picture = panorama if image is None else image
+    if sum(one is not None for one in (text, layout, image, panorama)) != 1:
+        raise TerrellaError("give one of text=, layout=, image= and panorama=.")
+    if picture is not None and isinstance(config, LiftSpaceConfig | None):
+        settings = config or LiftSpaceConfig()
+        return lift_space(
+            Path(picture), Path(out), replace(settings, panorama=panorama is not None or settings.panorama)
+        )
+    if picture is None and isinstance(config, BuildSpaceConfig | None):
         return build_space(text if layout is None else Path(layout), Path(out), config or BuildSpaceConfig())
-    raise TerrellaError("the config of an image is a LiftSpaceConfig, of text and layouts a BuildSpaceConfig.")
+    raise TerrellaError(
+        "the config of an image or a panorama is a LiftSpaceConfig, of text and layouts a BuildSpaceConfig."
+    )

@@ -1,16 +1,20 @@
-"""space lift: a place to walk in from one picture."""
+"""space lift: a place to walk in from one picture or one panorama."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from PIL import Image
 
 from ..core.errors import DatasetError, TerrellaError
+from ..space.camera import planar_pose
 from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of, to_gaussians
-from ..space.lifting.network import load_lifter
+from ..space.lifting.network import Lifter, load_lifter
+from ..space.lifting.panorama import PanoramaLayers, panorama_gaussians, panorama_layers, wraps
 from ..space.occupancy import Walker
 from ..space.pictures.reading import read_picture
 from ..space.raster import join
@@ -20,17 +24,23 @@ from ..worlds.splat_folder import check_free, save_splat
 from .splat_places import SpaceResult
 
 MOST_ASPECT = 4.0
+NARROWEST = 256  # pixels of the width of a panorama
 UNSURE, FLAT, PLAIN = 0.27, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
 EYE_M = (0.3, 2.2)  # heights of eyes that walk
+AXES = "x forward, y left, z up; metres; floor at 0"
 
 
 @dataclass(frozen=True)
 class LiftSpaceConfig:
     """How a picture becomes a place."""
 
-    longest: int = 512  # Pixels of the longer side; larger pictures are scaled down. Every pixel becomes a Gaussian.
+    longest: int = 512
+    """Pixels of the longer side (of a panorama: of half of it). Larger pictures are scaled down; every pixel becomes a Gaussian."""
     # Horizontal field of view of the lens in degrees. Default: estimated from the picture.
     fov: float | None = None
+    panorama: bool = False
+    """The picture shows all directions (equirectangular, 2:1). A picture of 2:1 whose left and right edges meet is taken as one
+    unless --fov is given."""
     # Height of the camera above the floor in metres, which gives the scale. Default: both estimated from the picture.
     eye: float | None = None
 
@@ -44,7 +54,18 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
     if config.fov is not None and not 20 <= config.fov <= 130 or config.eye is not None and not 0.1 <= config.eye <= 20:
         raise TerrellaError("--fov is from 20 to 130 degrees, and --eye from 0.1 to 20 metres.")
     check_free(out)
-    notes = _frames(picture)
+    notes, lifter = _frames(picture), load_lifter()
+    if config.panorama and config.fov is not None:
+        raise TerrellaError("--fov is for pictures of one direction, --panorama for those of all; leave one out.")
+    rgb = read_picture(picture, longest=2 * config.longest)
+    height, width = rgb.shape[:2]
+    if config.panorama or config.fov is None and wraps(rgb):
+        notes += (
+            []
+            if config.panorama
+            else ["taken as a panorama: it is 2:1 and its edges meet (--fov makes it a plain picture)."]
+        )
+        return _lift_panorama(picture, rgb, out, config, lifter, notes)
     rgb = read_picture(picture, longest=config.longest)
     height, width = rgb.shape[:2]
     if max(height, width) > MOST_ASPECT * min(height, width):
@@ -52,11 +73,44 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
     focal = None
     if config.fov is not None:
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
-    lifter = load_lifter()
     layers = layers_of(rgb, lifter, focal, config.eye)
     world = place_of(layers, picture.stem, {"picture": picture.name})
     save_splat(world, out)
-    return _result(layers, world, out, lifter.measured, [*notes, *doubts(layers)])
+    facts = {
+        "fov_deg": round(_fov(layers), 1), "pitch_deg": round(math.degrees(layers.pitch), 1),
+        "roll_deg": round(math.degrees(layers.roll), 1), "hidden_share": round(float((layers.hides > HIDES).float().mean()), 3),
+    }  # fmt: skip
+    camera = f"lens {facts['fov_deg']:.0f} degrees wide, pitch {facts['pitch_deg']:.0f} degrees, "
+    seen = _Seen(layers.depth, layers.error, layers.height_m, facts, camera)
+    return _result(seen, world, out, lifter.measured, [*notes, *doubts(layers)])
+
+
+def _lift_panorama(
+    picture: Path, rgb: np.ndarray, out: Path, config: LiftSpaceConfig, lifter: Lifter, notes: list[str]
+) -> SpaceResult:
+    """The place of a panorama uint8 [H, W, 3], seen from its middle."""
+    height, width = rgb.shape[:2]
+    if abs(width / height - 2) > 0.02 or width < NARROWEST:
+        raise DatasetError(
+            f"{picture} is {width} x {height} pixels after scaling; a panorama is equirectangular, twice as wide as high, "
+            f"and {NARROWEST} wide or more. Leave --panorama out for a picture of one direction."
+        )
+    even = np.asarray(Image.fromarray(rgb).resize((width // 4 * 4, width // 4 * 2), Image.Resampling.BOX))
+    layers = panorama_layers(even, lifter, config.eye)
+    world = panorama_place(layers, picture.stem, {"panorama": picture.name})
+    save_splat(world, out)
+    seen = _Seen(layers.distance, layers.error, layers.height_m, {"panorama": True}, "all directions, ")
+    return _result(seen, world, out, lifter.measured, notes)
+
+
+def panorama_place(layers: PanoramaLayers, name: str, card: dict) -> SplatWorld:
+    """The place of a panorama's layers: one begins in its middle, in eight directions."""
+    gaussians, seen = panorama_gaussians(layers)
+    high = torch.full((8,), layers.height_m)
+    starts = planar_pose(torch.zeros(8), torch.zeros(8), high, torch.arange(8) * (math.pi / 4))
+    origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
+    config = SplatConfig((0.5, 0.5 * 4 / 3, 0.5, 0.5), (192, 256), body=_walker(layers.height_m))
+    return SplatWorld(name, gaussians, origin, starts, config, card | {"axes": AXES})
 
 
 def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
@@ -68,13 +122,16 @@ def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
     height, width = layers.depth.shape
     share = 256 / max(height, width)
     size = (max(round(height * share), 8), max(round(width * share), 8))
-    eye = min(max(layers.height_m, EYE_M[0]), EYE_M[1])
-    body = Walker(radius_m=min(0.25, 0.3 * eye), eye_m=eye, step_m=min(0.35, 0.3 * eye))
     origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
-    facts = {"axes": "x forward, y left, z up; metres; floor at 0", "fov_deg": round(_fov(layers), 1)}
-    return SplatWorld(
-        name, gaussians, origin, layers.pose[None], SplatConfig(layers.camera, size, body=body), card | facts
-    )
+    facts = {"axes": AXES, "fov_deg": round(_fov(layers), 1)}
+    config = SplatConfig(layers.camera, size, body=_walker(layers.height_m))
+    return SplatWorld(name, gaussians, origin, layers.pose[None], config, card | facts)
+
+
+def _walker(height_m: float) -> Walker:
+    """A body whose eyes are where the camera was."""
+    eye = min(max(height_m, EYE_M[0]), EYE_M[1])
+    return Walker(radius_m=min(0.25, 0.3 * eye), eye_m=eye, step_m=min(0.35, 0.3 * eye))
 
 
 def doubts(layers: PictureLayers) -> list[str]:
@@ -124,23 +181,29 @@ def expected_error(measured: Mapping[str, float]) -> str:
     return f"error of depth to expect: {known}; of any other kind of picture it may be anything"
 
 
+class _Seen(NamedTuple):
+    """Of layers: depth and its error [H, W], the camera's height, figures for JSON, and the camera in words."""
+
+    depth: torch.Tensor
+    error: torch.Tensor
+    height_m: float
+    facts: dict[str, Any]
+    camera: str
+
+
 def _result(
-    layers: PictureLayers, world: SplatWorld, out: Path, measured: Mapping[str, float], notes: list[str]
+    layers: _Seen, world: SplatWorld, out: Path, measured: Mapping[str, float], notes: list[str]
 ) -> SpaceResult:
     near, far = layers.depth.flatten()[::7].quantile(torch.tensor([0.05, 0.95])).tolist()
     seen = int((world.provenance == OBSERVED).sum())
     facts = {
         "world": str(out), "gaussians": len(world.gaussians), "seen": seen, "invented": len(world.gaussians) - seen,
-        "fov_deg": round(_fov(layers), 1), "pitch_deg": round(math.degrees(layers.pitch), 1),
-        "roll_deg": round(math.degrees(layers.roll), 1), "height_m": round(layers.height_m, 2),
-        "near_m": round(near, 2), "far_m": round(far, 2), "expected_error": dict(measured),
-        "own_error": round(float(layers.error.mean()), 3),
-        "hidden_share": round(float((layers.hides > HIDES).float().mean()), 3), "notes": notes,
+        "height_m": round(layers.height_m, 2), "near_m": round(near, 2), "far_m": round(far, 2), **layers.facts,
+        "expected_error": dict(measured), "own_error": round(float(layers.error.mean()), 3), "notes": notes,
     }  # fmt: skip
     lines = [
         f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
-        f"lens {facts['fov_deg']:.0f} degrees wide, camera {facts['height_m']:.2f} m above the floor, "
-        f"pitch {facts['pitch_deg']:.0f} degrees; depth {near:.1f} to {far:.1f} m",
+        f"{layers.camera}camera {layers.height_m:.2f} m above the floor; depth {near:.1f} to {far:.1f} m",
         expected_error(measured),
         *notes,
         f"walk in it: terrella play {out}",

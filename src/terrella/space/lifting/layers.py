@@ -165,7 +165,11 @@ def _smoothed(near: torch.Tensor, spread: torch.Tensor, small: torch.Tensor) -> 
 
 def floor_height(layers: PictureLayers) -> float | None:
     """The height of the camera above the lowest level surface that fills enough of the picture, if there is one: metres."""
-    level, count = _level_points(layers), layers.depth.numel()
+    return lowest_level(level_points(_points(layers.depth, layers) @ layers.turn.T), layers.depth.numel())
+
+
+def lowest_level(level: torch.Tensor, count: int) -> float | None:
+    """How far below the camera the lowest of level points [N, 3] lie that are enough of `count` pixels: metres."""
     deep = -level[level[:, 2] < -0.15, 2]
     if len(deep) < FEWEST_FLOOR * count:
         return None
@@ -187,7 +191,7 @@ def levelled(layers: PictureLayers) -> PictureLayers:
         height = floor_height(now)
         if height is None:
             return layers
-        level = _level_points(now)
+        level = level_points(_points(now.depth, now) @ now.turn.T)
         near = level[(level[:, 2] + height).abs() < band * height]
         flat = torch.cat([near[:, :2], torch.ones(len(near), 1)], 1)
         a, b, _ = torch.linalg.lstsq(flat, near[:, 2:]).solution[:, 0].tolist()
@@ -198,9 +202,8 @@ def levelled(layers: PictureLayers) -> PictureLayers:
     return replace(now, height_m=floor_height(now) or now.height_m)
 
 
-def _level_points(layers: PictureLayers) -> torch.Tensor:
-    """Points [N, 3] of level surfaces, from the camera, along the world's axes."""
-    points = _points(layers.depth, layers) @ layers.turn.T
+def level_points(points: torch.Tensor) -> torch.Tensor:
+    """Of points [h, w, 3] of neighbouring pixels, along the world's axes, those of level surfaces: [N, 3]."""
     normal = torch.cross(points.diff(dim=1)[:-1], points.diff(dim=0)[:, :-1], dim=-1)
     return points[:-1, :-1][normal[..., 2].abs() > 0.94 * normal.norm(dim=-1)]
 
@@ -244,24 +247,41 @@ def floor_below(seen: Gaussians, layers: PictureLayers) -> Gaussians:
 
 def _of_pixels(depth: torch.Tensor, rgb: torch.Tensor, some: torch.Tensor, layers: PictureLayers) -> Gaussians:
     """One Gaussian for each pixel of `some` [h, w]."""
-    points, camera = _points(depth, layers), layers.camera
-    width = (depth / (camera[0] * depth.shape[1]))[..., None]
-    across, along = (_slope(points, depth, axis) for axis in (1, 0))
-    across = torch.where(across.norm(dim=-1, keepdim=True) > 0, across, width * torch.tensor([0.0, -1.0, 0.0]))
-    along = torch.where(along.norm(dim=-1, keepdim=True) > 0, along, width * torch.tensor([0.0, 0.0, -1.0]))
-    turn = layers.turn
-    across, along, points = across[some] @ turn.T, along[some] @ turn.T, points[some] @ turn.T
+    turn, size = layers.turn, depth / (layers.camera[0] * depth.shape[1])
+    return of_pixels(
+        _points(depth, layers) @ turn.T, depth, size, rgb, some, (-turn[:, 1], -turn[:, 2]), layers.height_m
+    )
+
+
+def of_pixels(
+    points: torch.Tensor,
+    depth: torch.Tensor,
+    size: torch.Tensor,
+    rgb: torch.Tensor,
+    some: torch.Tensor,
+    axes: tuple[torch.Tensor, torch.Tensor],
+    height_m: float,
+    stretch: torch.Tensor | float = 1.0,
+) -> Gaussians:
+    """One Gaussian for each pixel of `some` [h, w], tilted as its surface is. points [h, w, 3]: from the camera, along the world's
+    axes; depth [h, w]; size [h, w]: of a pixel, in metres; rgb [3, h, w]; axes: right and down where the surface is not known, [3]
+    or [h, w, 3]; stretch: how many pixels beside each other one stands for."""
+    slopes = [_slope(points, depth, axis) for axis in (1, 0)]
+    across, along = (
+        torch.where(slope.norm(dim=-1, keepdim=True) > 0, slope, size[..., None] * axis)
+        for slope, axis in zip(slopes, axes)
+    )
+    across, along, points = (across * stretch)[some], along[some], points[some]
     one = F.normalize(across, dim=1)
     normal = F.normalize(torch.linalg.cross(one, along), dim=1)
     two = torch.linalg.cross(normal, one)
-    size, thick = width[some][:, 0], torch.ones(len(points))
+    size = size[some]
     first = across.norm(dim=1).clamp(max=STEEPEST).minimum(STEEPEST * size)
     second = (along * two).sum(1).abs().minimum(STEEPEST * size)
-    scales = SIGMA * torch.stack([first.maximum(size), second.maximum(size), THIN * size * thick], 1)
+    scales = SIGMA * torch.stack([first.maximum(size), second.maximum(size), THIN * size], 1)
     quats = _quaternions(torch.stack([one, two, normal], 2))
-    means = points + torch.tensor([0.0, 0.0, layers.height_m])
-    colours = rgb[:, some].T
-    return Gaussians(means, quats, scales, torch.full((len(means),), OPACITY), plain_sh(colours))
+    means = points + torch.tensor([0.0, 0.0, height_m])
+    return Gaussians(means, quats, scales, torch.full((len(means),), OPACITY), plain_sh(rgb[:, some].T))
 
 
 def _slope(points: torch.Tensor, depth: torch.Tensor, axis: int) -> torch.Tensor:
