@@ -38,7 +38,11 @@ OPTIONS = {
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
     "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
-    "--seed --size --spread --steps --success --task --temperature --trust --within",
+    "--seed --size --skills --spread --steps --success --task --temperature --trust --within",
+    "skills learn": "--batch --json --learning-rate --out --policy --save-every-s --seed --steps",
+    "skills list": "--json",
+    "skills rename": "--json",
+    "skills try": "--adapter --episodes --fps --in --json --randomise --seed --size --task",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "bench costs": "--batch --device --fast --json --minutes --seed",
     "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",

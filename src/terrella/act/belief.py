@@ -15,6 +15,9 @@ from .actor import Actor, policy_folder, read_policy
 from .goal_network import KIND, GoalActor
 from .imitation import ImitationActor
 from .planning import Cost, GoalBeliefPolicy
+from .skills.actor import SkillActor
+from .skills.library import KIND as SKILLS
+from .skills.library import SkillLibrary
 
 
 @final
@@ -41,6 +44,8 @@ def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = No
     kind = read_policy(policy_folder(folder)).get("kind")
     if kind == imitation.KIND:
         return ImitationActor.load(folder, spec)
+    if kind == SKILLS:
+        return SkillActor(SkillLibrary.load(folder), spec)
     if kind == KIND:
         if world is None or cost is None:
             raise PlanningError(

@@ -19,6 +19,7 @@ from ..core.world import Observation
 from .actor import load_network, write_policy
 from .actor_network import ActorConfig
 from .imitation_network import TEXT, ImitationConfig, ImitationNetwork
+from .sentences import WORDS
 
 KIND, VERSION = "imitation", 1
 _STREAM = 12
@@ -49,6 +50,7 @@ class ImitationActor:
             {
                 "features": torch.zeros(batch, *seen),  # of the last observations, or the memory of all
                 "acted": torch.zeros(batch, config.window, width),
+                "words": torch.zeros(batch, WORDS, dtype=torch.int64),  # of the instruction that is remembered
                 "chunk": torch.zeros(batch, config.chunk, width),
                 "taken": torch.full((batch,), -1),  # actions of the chunk that were taken; -1 at the start
             }
@@ -60,10 +62,11 @@ class ImitationActor:
         network, config, batch = self.network, self.network.config, memory.batch
         if missing := [name for name in self.sees if name not in observation]:
             raise ChannelError(f"the policy sees {', '.join(missing)}, which the observation lacks.")
-        words = self._words(observation[TEXT]) if network.words is not None else None
+        spoken, words = self._words(observation[TEXT]) if network.words is not None else (memory["words"], None)
         device, features = network.mean.device, network.features(observation, words)[:, None]
         if config.remember:
-            history, after = network.recall(features, memory["features"][:, 0].to(device))
+            same = (spoken == memory["words"]).all(1)[:, None]  # a new instruction begins without memory
+            history, after = network.recall(features, (memory["features"][:, 0] * same).to(device))
             kept = after[:, None].cpu()
         else:
             first, features = (memory["taken"] < 0)[:, None, None], features.cpu()
@@ -79,21 +82,23 @@ class ImitationActor:
             chunk, taken = torch.where(anew[:, None, None], predicted, chunk), torch.where(anew, 0, taken)
         encoded = chunk[torch.arange(batch), taken]
         acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
-        after = {"features": kept, "acted": acted, "chunk": chunk, "taken": taken + 1}
+        after = {"features": kept, "acted": acted, "words": spoken, "chunk": chunk, "taken": taken + 1}
         return config.decode(encoded, self.spec), State(after)
 
     def unknown(self, text: str) -> tuple[str, ...]:
         """The words of an instruction that it does not know."""
         return self.network.words.unknown(text) if self.network.words is not None else ()
 
-    def _words(self, padded: torch.Tensor) -> torch.Tensor:
+    def _words(self, padded: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The instructions as numbers [B, WORDS], and their features."""
         assert self.network.words is not None
         texts = [bytes_to_text(row.numpy()) for row in padded.cpu()]
         if new := [text for text in dict.fromkeys(texts) if text not in self._warned and self.unknown(text)]:
             self._warned.update(new)
             names = ", ".join(dict.fromkeys(f"'{word}'" for text in new for word in self.unknown(text)))
             warnings.warn(f"the policy does not know {names} and leaves that out of the instruction.", stacklevel=3)
-        return self.network.words(self.network.words.read(texts).to(self.network.mean.device))
+        spoken = self.network.words.read(texts)
+        return spoken, self.network.words(spoken.to(self.network.mean.device))
 
     @staticmethod
     def write(network: ImitationNetwork, folder: str | Path, card: Mapping[str, Any]) -> None:
@@ -106,8 +111,14 @@ class ImitationActor:
         """Loads a saved policy, from its folder or that of the training run. CheckpointError if it is missing or foreign,
         ActionError or ChannelError if `spec` has other actions or lacks a channel."""
 
-        def make(config: dict[str, Any]) -> ImitationNetwork:
-            return ImitationNetwork(ImitationConfig(**{**config, "actor": ActorConfig(**config["actor"])}))
-
-        network, card = load_network(folder, KIND, VERSION, make)
+        network, card = load_imitation_network(folder)
         return ImitationActor(network, spec, card)
+
+
+def load_imitation_network(folder: str | Path) -> tuple[ImitationNetwork, dict[str, Any]]:
+    """The network of a saved policy, and its card. CheckpointError if it is missing or foreign."""
+
+    def make(config: dict[str, Any]) -> ImitationNetwork:
+        return ImitationNetwork(ImitationConfig(**{**config, "actor": ActorConfig(**config["actor"])}))
+
+    return load_network(folder, KIND, VERSION, make)

@@ -170,10 +170,16 @@ class ImitationNetwork(nn.Module):
         flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
         return symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG)
 
+    @property
+    def recalled_width(self) -> int:
+        """Features of an observation, and what is remembered beside them."""
+        return self.width + (self.config.actor.hidden if self.memory else 0)
+
     def recall(self, features: torch.Tensor, memory: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        """Features [N, T, width] with what is remembered beside them [N, T, width + hidden], and the memory after them [N, hidden].
-        memory: that before them; None at the start of an episode."""
-        assert self.memory is not None
+        """Features [N, T, width] with what is remembered beside them [N, T, width + hidden], and the memory after them [N, hidden];
+        the features alone for a policy without memory. memory: that before them; None at the start of an episode."""
+        if self.memory is None:
+            return features, features[:, -1, :0]
         recalled, last = self.memory(features, None if memory is None else memory[None])
         return torch.cat([features, recalled], 2), last[0]
 

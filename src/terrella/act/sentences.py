@@ -48,6 +48,10 @@ class WordEncoder(nn.Module):
     def unknown(self, text: str) -> tuple[str, ...]:
         return tuple(dict.fromkeys(word for word, number in self._read(text) if not number))
 
+    def spelled(self, text: str) -> tuple[str, ...]:
+        """The words of a text that it knows, as the vocabulary spells them."""
+        return tuple(self.vocabulary[number - 1] for _, number in self._read(text) if number)
+
     def forward(self, words: torch.Tensor) -> torch.Tensor:
         """[N, width]"""
         words = words[:, : max(1, int((words != 0).any(0).sum()))]  # beyond, there are none

@@ -37,6 +37,10 @@ COMMANDS = {
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
     "train policy": ("train_policy:policy", "train a policy on imagined rollouts of a world, or by imitation"),
     "train inverse": ("train_policy:inverse", "learn which actions clips show, from a few labelled episodes"),
+    "skills learn": ("skills:learn", "learn a library of skills from a recording and a policy that imitates it"),
+    "skills list": ("skills:list_", "list the skills of a library"),
+    "skills rename": ("skills:rename", "give a skill another name"),
+    "skills try": ("skills:try_", "try a skill in an environment, and count how often it works"),
     "train goals": ("train:goals", "train a policy that reaches goals in a latent world, without a search"),
     "train estimator": (
         "train:estimator",

@@ -79,7 +79,7 @@ class DemonstrationRows:
 
     def at(self, rows: np.ndarray) -> Demonstrations:
         """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero. For a policy that
-        remembers: windows that hold them, of whole episodes where these are short."""
+        remembers: windows that hold them, within one instruction and whole where that is short."""
         if self.config.remember:
             return self._windows(rows)
         config, start = self.config, self.recording.start[rows]
@@ -88,11 +88,11 @@ class DemonstrationRows:
         return self._moments(rows, back, shown, rows)
 
     def _windows(self, rows: np.ndarray) -> Demonstrations:
-        first = np.maximum(self.recording.start[rows], rows - self.config.remember + 1)
-        longest = min(self.config.remember, int((self.stop[rows] - first).max()))
-        steps = first[:, None] + np.arange(longest)
-        inside = steps < self.stop[rows][:, None]
-        moments = np.minimum(steps, self.stop[rows][:, None] - 1).ravel()
+        start, stop = self._instructed(rows)
+        first = np.maximum(start, rows - self.config.remember + 1)
+        steps = first[:, None] + np.arange(min(self.config.remember, int((stop - first).max())))
+        inside, longest = steps < stop[:, None], steps.shape[1]
+        moments = np.minimum(steps, stop[:, None] - 1).ravel()
         shown, places = np.unique(moments, return_inverse=True)
         batch = self._moments(moments, moments[:, None], shown, rows)
         weight = batch.weight * torch.from_numpy(inside.reshape(-1, 1)).to(self.device)
@@ -100,14 +100,29 @@ class DemonstrationRows:
         windows = torch.from_numpy(places.reshape(steps.shape)).to(self.device)
         return replace(batch, weight=weight, windows=windows, requested=requested)
 
+    def _instructed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(first row [N], row after the last [N]) of the same instruction in the same episode."""
+        start, stop = self.recording.start[rows], self.stop[rows]
+        if self.words is None:
+            return start, stop
+        changes = np.flatnonzero(np.diff(np.array(self.recording.cache.arrays["task"]).reshape(-1))) + 1
+        changes = np.concatenate([[0], changes, [self.recording.cache.length]])
+        after = np.searchsorted(changes, rows, side="right")
+        return np.maximum(start, changes[after - 1]), np.minimum(stop, changes[after])
+
+    def observations(self, rows: np.ndarray) -> dict[str, torch.Tensor]:
+        """What the policy sees at `rows`: channel -> [N, ...]."""
+        cache, seen = self.recording.cache, {}
+        for name, _ in self.config.actor.sees:
+            array = array_for(name, cache.arrays, cache.keys)
+            assert array is not None
+            seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][rows])).to(self.device)
+        return seen
+
     def _moments(self, rows: np.ndarray, back: np.ndarray, shown: np.ndarray, spoken: np.ndarray) -> Demonstrations:
         """The actions from `rows` [N] on and before the observations `back` [N, H], the observations `shown` and the
         instructions of the rows `spoken`."""
-        config, cache, start, seen = self.config, self.recording.cache, self.recording.start[rows], {}
-        for name, _ in config.actor.sees:
-            array = array_for(name, cache.arrays, cache.keys)
-            assert array is not None
-            seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][shown])).to(self.device)
+        config, start, seen = self.config, self.recording.start[rows], self.observations(shown)
         before = torch.from_numpy((back - 1).clip(start[:, None], self.stop[rows][:, None] - 1))
         acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], self.actions[before], 0.0)
         ahead = rows[:, None] + np.arange(config.chunk)

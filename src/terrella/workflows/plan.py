@@ -7,9 +7,12 @@ from .plan_result import PlanResult, save_result
 from .plan_study import PlanConfig, open_study, refuse
 from .progress import Progress, silent
 from .results import folder_name
+from .skills import SkillPlanResult, plan_with_skills
 
 
-def plan(world: str | Path, config: PlanConfig | None = None, *, progress: Progress = silent) -> PlanResult:
+def plan(
+    world: str | Path, config: PlanConfig | None = None, *, progress: Progress = silent
+) -> PlanResult | SkillPlanResult:
     """Plans in a world and acts in the real environment. Returns how often that reached the goal, beside acting at random.
 
     world: a name of `terrella list`, the path of a checkpoint, or a simulator itself (gym:CartPole-v1). The page, the film and
@@ -17,6 +20,8 @@ def plan(world: str | Path, config: PlanConfig | None = None, *, progress: Progr
     where the settings do not fit the world, before anything is played.
     """
     config, name = config or PlanConfig(), str(world)
+    if config.skills is not None:
+        return plan_with_skills(name, config, progress=progress)
     if config.agent:
         refuse(config, f"{config.agent} acts in place of the search", "cost", "proposal", *vars(config.search))
     study = open_study(name, config, progress)

@@ -63,6 +63,9 @@ class PlanConfig:
     """A policy whose plans the search also tries: a folder of `train goals`, or a policy name as for `terrella evaluate`."""
     agent: str | None = None
     """A policy that acts instead of the search: a folder, or a policy name as for `terrella evaluate`."""
+    skills: Path | None = None
+    """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills. Without --goal
+    each episode has the environment's own instruction."""
     real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
     environment: EnvironmentConfig = EnvironmentConfig()
     episodes: int = 10  # Number of episodes.

@@ -1,0 +1,139 @@
+"""SkillLibrary: a folder of skills, instructions that a policy follows: when they can begin, what they bring about, how likely
+they work."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from ...core.errors import CheckpointError, PlanningError
+from ...core.files import remedy_of, replacing, write_text
+from ...core.similar import did_you_mean
+from ...core.world import Observation
+from ..actor import DAMAGE, POLICY_FILE, load_network, read_policy, write_policy
+from ..imitation import ImitationActor, load_imitation_network
+from ..imitation_network import ImitationNetwork
+from .phrases import Phrase
+from .predictor import SkillOutlook, SkillPredictor
+
+KIND, VERSION = "skills", 1
+FAST_FOLDER, ENDS_FILE = (
+    "fast",
+    "ends.safetensors",
+)  # the policy that carries skills out; observations at which they ended
+
+
+@dataclass(frozen=True)
+class Skill:
+    """What a policy does at instructions of one phrase."""
+
+    name: str
+    phrase: Phrase
+    tries: int  # segments of recordings and attempts
+    successes: int  # of these
+    steps: float  # median of the successful ones
+    least_steps: int  # 99% of the successful ones take as many
+    most_steps: int  # 95% of the successful ones take no more
+
+    @property
+    def works(self) -> float:
+        """The probability that it works where it can begin: the mean of a beta distribution."""
+        return (self.successes + 1) / (self.tries + 2)
+
+
+@dataclass(frozen=True)
+class SkillLibrary:
+    """Skills, the policy that carries them out, and observations at which they ended: what they bring about."""
+
+    skills: tuple[Skill, ...]
+    network: ImitationNetwork
+    predictor: SkillPredictor
+    ends: Mapping[str, torch.Tensor]  # channel -> [E, ...]
+    end_texts: tuple[str, ...]  # the instruction of each end; "" for the starts of any instruction, which come last
+    threshold: float = 0.0  # log odds of `done` from which an instruction counts as done
+    card: Mapping[str, Any] | None = None
+
+    def named(self, name: str) -> Skill:
+        """The skill of a name; PlanningError if there is none."""
+        for skill in self.skills:
+            if skill.name == name:
+                return skill
+        names = [skill.name for skill in self.skills]
+        raise PlanningError(
+            f"there is no skill '{name}'{did_you_mean(name, names) or '.'} There are: {', '.join(names)}."
+        )
+
+    def renamed(self, name: str, new: str) -> SkillLibrary:
+        """The library with another name for a skill; PlanningError if there is none, or the new name is taken."""
+        if new in (skill.name for skill in self.skills if skill.name != name) or not new.strip():
+            raise PlanningError(f"'{new}' is no free name for a skill; choose another.")
+        return self._with(replace(self.named(name), name=new), name)
+
+    def tried(self, name: str, tries: int, successes: int) -> SkillLibrary:
+        """The library with further attempts of a skill."""
+        skill = self.named(name)
+        return self._with(replace(skill, tries=skill.tries + tries, successes=skill.successes + successes), name)
+
+    def _with(self, skill: Skill, name: str) -> SkillLibrary:
+        return replace(self, skills=tuple(skill if one.name == name else one for one in self.skills))
+
+    @torch.no_grad()
+    def outlook(self, seen: Observation, texts: Sequence[str], memory: torch.Tensor | None = None) -> SkillOutlook:
+        """What observations [N, ...] promise for N instructions. memory: the policy's [N, hidden], None where they begin."""
+        words = self.network.words
+        assert words is not None
+        spoken = words(words.read(texts).to(self.network.mean.device))
+        recalled, _ = self.network.recall(self.network.features(seen, spoken)[:, None], memory)
+        return self.predictor(recalled[:, 0], spoken)
+
+    def skill_of(self, text: str) -> Skill | None:
+        """The skill of a whole instruction."""
+        words = text.split()
+        fits = (skill for skill in self.skills if len(skill.phrase.places) == len(words))
+        return next((one for one in fits if all(w in place for w, place in zip(words, one.phrase.places))), None)
+
+    def write(self, folder: str | Path) -> None:
+        """Writes the folder, each file atomically; CheckpointError if it cannot be written."""
+        folder = Path(folder)
+        skills = [{**asdict(skill), "phrase": skill.phrase.places} for skill in self.skills]
+        config = {"skills": skills, "end_texts": self.end_texts, "threshold": self.threshold}
+        ImitationActor.write(self.network, folder / FAST_FOLDER, {})
+        write_policy(
+            folder, {"kind": KIND, "version": VERSION, "config": config, "card": self.card or {}}, self.predictor
+        )
+        try:
+            with replacing(folder / ENDS_FILE) as staged:
+                save_file({name: value.contiguous() for name, value in self.ends.items()}, staged)
+        except OSError as error:
+            raise CheckpointError(f"{folder} cannot be written ({error}); {remedy_of(error)}.") from error
+
+    def write_names(self, folder: str | Path) -> None:
+        """Writes only what `renamed` and `tried` change."""
+        saved = read_policy(folder)
+        saved["config"]["skills"] = [{**asdict(skill), "phrase": skill.phrase.places} for skill in self.skills]
+        write_text(Path(folder) / POLICY_FILE, json.dumps(saved, indent=1) + "\n")
+
+    @staticmethod
+    def load(folder: str | Path) -> SkillLibrary:
+        """The library of a folder; CheckpointError if it is missing, foreign or damaged."""
+        folder = Path(folder)
+        if read_policy(folder).get("kind") != KIND:
+            raise CheckpointError(f"{folder} holds no skills; make a library of them with: terrella skills learn.")
+        network, _ = load_imitation_network(folder / FAST_FOLDER)
+        assert network.words is not None
+        widths = network.recalled_width, network.words.width
+        predictor, card = load_network(folder, KIND, VERSION, lambda _: SkillPredictor(*widths))
+        try:
+            config, ends = read_policy(folder)["config"], load_file(folder / ENDS_FILE)
+            skills = tuple(
+                Skill(**{**one, "phrase": Phrase(tuple(map(tuple, one["phrase"])))}) for one in config["skills"]
+            )
+            return SkillLibrary(skills, network, predictor, ends, tuple(config["end_texts"]), config["threshold"], card)
+        except DAMAGE as error:
+            raise CheckpointError(f"{folder} is damaged or incomplete ({error}); copy or learn it again.") from error

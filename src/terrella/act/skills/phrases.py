@@ -1,0 +1,94 @@
+"""The language of skills: phrases with places for words, mined from instructions, and goals of several phrases."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from ..sentences import words_of
+
+ARTICLES = ("the", "a", "an")
+MOST_FILLINGS = 64  # instructions that a phrase with open places stands for, at most
+_THEN = re.compile(r"[,;.]?\s*\b(?:and\s+)?then\b[\s,]*|[;.]\s*")
+_AFTER = re.compile(r"[,]?\s*\bafter\s+(?:you\s+)?(?:have\s+)?")
+_AND = re.compile(r"\s*,\s*(?:and\s+)?|\s+and\s+")
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """An instruction with places: at each the words that may stand there, one word where it is fixed."""
+
+    places: tuple[tuple[str, ...], ...]
+
+    @property
+    def name(self) -> str:
+        """Its fixed words, and _ for each open place."""
+        return " ".join(place[0] if len(place) == 1 else "_" for place in self.places)
+
+    def __str__(self) -> str:
+        return " ".join("|".join(place) for place in self.places)
+
+    def fillings(self, words: Sequence[str]) -> list[str]:
+        """The instructions of this phrase that these words leave open; [] if they do not fit. Articles may be left out."""
+        chosen = self._fit(tuple(words), 0)
+        if chosen is None:
+            return []
+        return [" ".join(each) for each in itertools.islice(itertools.product(*chosen), MOST_FILLINGS)]
+
+    def _fit(self, words: tuple[str, ...], at: int) -> list[tuple[str, ...]] | None:
+        """The words for each place from `at` on."""
+        if words and (at == len(self.places) or words[0] not in self.places[at]) and words[0] in ARTICLES:
+            return self._fit(words[1:], at)
+        if at == len(self.places):
+            return None if words else []
+        place = self.places[at]
+        if words and words[0] in place and (rest := self._fit(words[1:], at + 1)) is not None:
+            return [words[:1], *rest]
+        article = all(word in ARTICLES for word in place)
+        if not article and len(place) == 1:
+            return None
+        rest = self._fit(words, at + 1)
+        return None if rest is None else [place[-1:] if article else place, *rest]
+
+
+def phrases_of(texts: Iterable[str]) -> dict[Phrase, list[str]]:
+    """The phrases of instructions, with the instructions of each. Words are of one class if one may stand for the other in two
+    instructions that are else the same; instructions of the same classes are one phrase."""
+    texts = list(dict.fromkeys(texts))
+    split = {text: words_of(text) for text in texts}
+    alike: dict[tuple, set[str]] = defaultdict(set)
+    for words in split.values():
+        for at in range(len(words)):
+            alike[(*words[:at], None, *words[at + 1 :])].add(words[at])
+    of = {word: word for words in split.values() for word in words}
+
+    def first(word: str) -> str:
+        while of[word] != word:
+            word = of[word]
+        return word
+
+    for group in alike.values():
+        for word in group:
+            of[first(word)] = first(min(group))
+    grouped: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for text, words in split.items():
+        grouped[tuple(first(word) for word in words)].append(text)
+    phrases = {}
+    for group in grouped.values():
+        places = tuple(tuple(sorted(set(each))) for each in zip(*(split[text] for text in group)))
+        phrases[Phrase(places)] = group
+    return phrases
+
+
+def goal_of(text: str) -> tuple[tuple[str, ...], ...]:
+    """The phrases of a goal, in groups: the groups in their order, the phrases of a group in any. "A and B, then C" and "C after
+    you A and B" are ((A, B), (C,))."""
+    groups: list[tuple[str, ...]] = []
+    for part in _THEN.split(text.strip().lower()):
+        for each in reversed(_AFTER.split(part)):
+            phrases = tuple(phrase.strip() for phrase in _AND.split(each) if words_of(phrase))
+            groups += [phrases] if phrases else []
+    return tuple(groups)

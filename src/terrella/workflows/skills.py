@@ -1,0 +1,235 @@
+"""`skills learn`, `skills list`, `skills rename`, `skills try` and `plan --skills`: a library of skills, and plans made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from tyro.conf import arg
+
+from ..act.actor import policy_folder
+from ..act.imitation import load_imitation_network
+from ..act.skills.actor import SkillActor, SkillMemory
+from ..act.skills.library import SkillLibrary
+from ..act.skills.search import SkillSearch
+from ..core.errors import TerrellaError
+from ..core.instruction import bytes_to_text
+from ..core.policy import act
+from ..core.world import World, make_rng
+from ..learn.recipes.imitation import open_demonstrations
+from ..learn.recipes.skills import SkillTraining, learn_skills
+from ..measure.statistics import Figure, wilson
+from .goals import REWARD
+from .opening import EnvironmentConfig
+from .plan_study import PlanConfig
+from .progress import Progress, silent, stage
+from .real_environment import STEPS
+from .results import changed_settings, jsonable, table_lines
+
+MOST_STARTS = 50  # starts of an environment that are drawn for each try, until its instruction is one of the skill
+
+
+@dataclass(frozen=True)
+class LearnSkillsConfig:
+    """Settings of `skills learn`."""
+
+    policy: str  # The folder of a policy that imitates the recording (train policy --method imitation).
+    out: Path  # Folder of the library.
+    training: SkillTraining = SkillTraining()
+
+
+@dataclass(frozen=True)
+class TrySkillConfig:
+    """Settings of `skills try`."""
+
+    inside: Annotated[str, arg(name="in")]  # The environment (gym:BabyAI-GoToLocal-v0).
+    environment: EnvironmentConfig = EnvironmentConfig()
+    episodes: int = 20  # Tries of the skill.
+    seed: int = 0  # The same seed gives the same starts.
+
+
+@dataclass(frozen=True)
+class LibraryResult:
+    """A library of skills."""
+
+    library: SkillLibrary
+    facts: Mapping[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        skills = [
+            {"name": one.name, "phrase": str(one.phrase), "tries": one.tries, "works": one.works, "steps": one.steps}
+            for one in self.library.skills
+        ]
+        return jsonable({"skills": skills, **self.facts})
+
+    def summary(self) -> str:
+        rows = []
+        for one in self.library.skills:
+            steps = f"{one.steps:.0f} ({one.least_steps} to {one.most_steps})"
+            rows.append([one.name, f"{one.works:.0%} of {one.tries}", steps, str(one.phrase)])
+        lines = table_lines(["skill", "works", "steps", "instructions"], rows)
+        if "ends_recognised" in self.facts:
+            lines.append(
+                f"Of {self.facts['tested_segments']} segments {self.facts['ends_recognised']:.1%} are ended at their end, and "
+                f"{self.facts['ended_too_early']:.1%} before it."
+            )
+        lines += [
+            f"'{one}' is left out: its end looks like any other moment." for one in self.facts.get("without_effect", ())
+        ]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class TriesResult:
+    """Attempts of a skill in an environment."""
+
+    name: str
+    success: Figure  # By the environment's reward.
+    recognised: Figure  # Attempts of which the library says rightly whether they are done.
+
+    def to_json(self) -> dict[str, Any]:
+        return jsonable({"skill": self.name, "success": asdict(self.success), "recognised": asdict(self.recognised)})
+
+    def summary(self) -> str:
+        return (
+            f"'{self.name}' works in {self.success} of its tries; the library is right about whether it is done in "
+            f"{self.recognised}. Plans count on that from now on."
+        )
+
+
+@dataclass(frozen=True)
+class SkillEpisode:
+    """An episode by a plan of skills."""
+
+    events: tuple[str, ...]  # what was planned, done and planned anew
+    finished: bool  # all instructions are done, by the library's own judgement
+    reward: float
+    steps: int
+
+
+@dataclass(frozen=True)
+class SkillPlanResult:
+    """Episodes by plans of skills."""
+
+    goal: str | None  # None: each episode has a goal of its own
+    episodes: tuple[SkillEpisode, ...]
+    stopped: bool = False
+
+    @property
+    def finished(self) -> Figure:
+        return wilson(sum(one.finished for one in self.episodes), len(self.episodes))
+
+    @property
+    def rewarded(self) -> Figure:
+        return wilson(sum(one.reward > 0 for one in self.episodes), len(self.episodes))
+
+    def to_json(self) -> dict[str, Any]:
+        shares = {"finished": asdict(self.finished), "rewarded": asdict(self.rewarded)}
+        return jsonable({"goal": self.goal, **shares, "episodes": [asdict(one) for one in self.episodes]})
+
+    def summary(self) -> str:
+        lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
+        lines += [] if self.goal else [f"The environment rewarded {self.rewarded}."]
+        for number, one in enumerate(self.episodes[:3], 1):
+            lines += [f"episode {number}, {one.steps} steps:", *(f"    {event}" for event in one.events)]
+        return "\n".join(lines)
+
+
+def learn_library(data: str | Path, config: LearnSkillsConfig, *, progress: Progress = silent) -> LibraryResult:
+    """Learns skills from a recording and a policy that imitates it: their phrases are mined from its instructions. TerrellaError
+    for what cannot be learned from."""
+    network, _ = load_imitation_network(config.policy)
+    sees, size = [name for name, _ in network.config.actor.sees], network.config.size
+    with stage("learning skills", progress) as report:
+        recording, _ = open_demonstrations(data, sees, size, report)
+        library, facts = learn_skills(recording, policy_folder(config.policy), config.out, config.training, report)
+    return LibraryResult(library, facts)
+
+
+def list_skills(library: str | Path) -> LibraryResult:
+    """The skills of a library."""
+    return LibraryResult(SkillLibrary.load(library), {})
+
+
+def rename_skill(library: str | Path, name: str, new: str) -> LibraryResult:
+    """Another name for a skill."""
+    renamed = SkillLibrary.load(library).renamed(name, new)
+    renamed.write_names(library)
+    return LibraryResult(renamed, {})
+
+
+def try_skill(folder: str | Path, name: str, config: TrySkillConfig, *, progress: Progress = silent) -> TriesResult:
+    """Tries a skill in an environment that gives its instructions and rewards, and counts the tries in the library."""
+    library, world = SkillLibrary.load(folder), config.environment.open(config.inside)
+    episodes, seed = config.episodes, config.seed
+    skill, actor = library.named(name), SkillActor(library, world.spec)
+    world.spec.check_channels(("reward", "done"))
+    won, right, rng, tried = 0, 0, make_rng(seed), 0
+    with stage("trying", progress) as report:
+        for start in range(MOST_STARTS * episodes):
+            state = world.start(1, make_rng(seed + start))
+            text = bytes_to_text(world.render(state, ("text",))["text"][0].numpy())
+            if tried == episodes or library.skill_of(text) != skill:
+                continue
+            one = _episode(world, state, actor, world.spec.max_episode_steps or STEPS, rng)
+            won, right, tried = won + (one.reward > 0), right + ((one.reward > 0) == one.finished), tried + 1
+            report(tried, episodes)
+    if not tried:
+        raise TerrellaError(f"{world.spec.name} gave no instruction of '{name}' in {MOST_STARTS * episodes} starts.")
+    library.tried(name, tried, won).write_names(folder)
+    return TriesResult(name, wilson(won, tried), wilson(right, tried))
+
+
+def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = silent) -> SkillPlanResult:
+    """Plans with the skills of a library and acts in an environment. PlanningError for a goal that it does not understand, or that
+    no order of its skills is likely to reach from the first start."""
+    used = {"goal", "skills", "real", "episodes", "steps", "seed"}
+    if useless := [key for key in changed_settings(config) if key.replace("-", "_") not in used]:
+        raise TerrellaError(f"--{useless[0].replace('_', '-')}: plans of skills have no use for that.")
+    assert config.skills is not None
+    library, world = SkillLibrary.load(config.skills), EnvironmentConfig().open(config.real or name)
+    goal = None if config.goal == REWARD else config.goal
+    actor, steps = SkillActor(library, world.spec, goal), config.steps or world.spec.max_episode_steps or STEPS
+    if goal is not None:
+        search = SkillSearch(library)
+        first = world.render(world.start(1, make_rng(config.seed)), actor.sees)
+        plan = search.plan(search.instructions_of(goal), first)
+        progress(f"the plan: {plan}, {plan.probability:.0%} in all")
+    episodes, rng = list[SkillEpisode](), make_rng(config.seed)
+    try:
+        with stage("acting", progress) as report:
+            for number in range(config.episodes):
+                state = world.start(1, make_rng(config.seed + number))
+                episodes.append(_episode(world, state, actor, steps, rng))
+                report(number + 1, config.episodes)
+    except KeyboardInterrupt:
+        if not episodes:
+            raise
+        return SkillPlanResult(goal, tuple(episodes), True)
+    return SkillPlanResult(goal, tuple(episodes))
+
+
+@torch.no_grad()
+def _episode(world: World, state: Any, actor: SkillActor, steps: int, rng: torch.Generator) -> SkillEpisode:
+    """One episode; it ends when the plan is done, the environment ends it, or after `steps` steps."""
+    outcome = [name for name in ("reward", "done") if name in world.spec.channels]
+    channels, memory, reward = (*actor.sees, *outcome), actor.begin(1, rng), 0.0
+    seen = world.render(state, channels)
+    for step in range(steps):
+        action, memory = act(actor, seen, memory, 1, world.spec, rng)
+        if _finished(memory[0]):
+            return SkillEpisode(memory[0].events, True, reward, step)
+        state = world.imagine(state, action, rng)
+        seen = world.render(state, channels)
+        reward += float(seen["reward"]) if "reward" in seen else 0.0
+        if "done" in seen and bool(seen["done"]):
+            _, memory = act(actor, seen, memory, 1, world.spec, rng)
+            return SkillEpisode(memory[0].events, _finished(memory[0]), reward, step + 1)
+    return SkillEpisode(memory[0].events, False, reward, steps)
+
+
+def _finished(memory: SkillMemory) -> bool:
+    return memory.plan is not None and memory.at == len(memory.plan.steps)

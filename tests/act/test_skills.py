@@ -1,0 +1,139 @@
+"""Skills: phrases are mined from instructions, goals are read, and the likeliest order is chosen; all without a trained network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from terrella.act.actor_network import ActorConfig
+from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
+from terrella.act.sentences import vocabulary_of
+from terrella.act.skills.library import Skill, SkillLibrary
+from terrella.act.skills.phrases import goal_of, phrases_of
+from terrella.act.skills.predictor import SkillOutlook, SkillPredictor
+from terrella.act.skills.search import SkillSearch, undone
+from terrella.core.errors import CheckpointError, PlanningError
+
+TEXTS = [
+    f"{verb} {colour} {kind}"
+    for verb in ("go to the", "pick up the")
+    for colour in ("red", "blue")
+    for kind in ("key", "box")
+]
+TEXTS += [f"put the {colour} box next to the {other} key" for colour in ("red", "blue") for other in ("red", "blue")]
+START, FREE, CARRIES = 0, 1, 2  # what the one channel of these tests holds
+
+
+@dataclass(frozen=True)
+class Known(SkillLibrary):
+    """Its predictions are a rule: nothing but going begins while something is carried, and blue things suit it half as often."""
+
+    def outlook(self, seen, texts, memory=None):
+        suits = []
+        for value, text in zip(seen["hand"][:, 0].tolist(), texts):
+            carried = 0.01 if value == CARRIES and not text.startswith("go") else 1.0
+            suits.append(carried * (0.5 if value == FREE and "blue" in text else 1.0))
+        logits = torch.tensor(suits).log()
+        return SkillOutlook(logits, logits * 0, logits * 0 + 1)
+
+
+def library_of(kind=Known):
+    torch.manual_seed(0)
+    actor = ActorConfig((("hand", (1,)),), "choice", (), (0.0,), (2.0,), hidden=8)
+    network = ImitationNetwork(ImitationConfig(actor, vocabulary=vocabulary_of(TEXTS), history=1)).eval()
+    skills = tuple(Skill(phrase.name, phrase, 98, 98, 4.0, 1, 9) for phrase in phrases_of(TEXTS))
+    texts = (*TEXTS, "", "")
+    hands = [CARRIES if text.startswith("pick") else FREE if text else START for text in texts]
+    ends = {"hand": torch.tensor(hands)[:, None].float()}
+    predictor = SkillPredictor(network.recalled_width, network.words.width)
+    return kind(skills, network, predictor, ends, texts)
+
+
+def planned(goal, hand=START):
+    search = SkillSearch(library_of())
+    return search.plan(search.instructions_of(goal), {"hand": torch.tensor([[float(hand)]])})
+
+
+def test_phrases_have_places_where_words_stand_for_each_other():
+    phrases = phrases_of([*TEXTS, "wait"])
+    assert {phrase.name: len(texts) for phrase, texts in phrases.items()} == {
+        "go to the _ _": 4,
+        "pick up the _ _": 4,
+        "put the _ box next to the _ key": 4,
+        "wait": 1,
+    }
+    going = next(phrase for phrase in phrases if phrase.name.startswith("go"))
+    assert str(going) == "go to the blue|red box|key"
+    assert going.fillings("go to red key".split()) == ["go to the red key"] == going.fillings("go to a red key".split())
+    assert going.fillings("go to the box".split()) == ["go to the blue box", "go to the red box"]
+    assert not going.fillings("go to the red key now".split()) and not going.fillings("pick up the red key".split())
+
+
+@pytest.mark.parametrize(
+    "text, groups",
+    [
+        ("Go to A, then pick up B and drop it, and then wait.", (("go to a",), ("pick up b", "drop it"), ("wait",))),
+        ("go to a after you pick up b and pick up c", (("pick up b", "pick up c"), ("go to a",))),
+        ("a and b, then c after you d", (("a", "b"), ("d",), ("c",))),
+        ("a, b; c", (("a", "b"), ("c",))),
+        (" . ", ()),
+    ],
+)
+def test_a_goal_is_groups_of_phrases_in_order(text, groups):
+    assert goal_of(text) == groups
+
+
+def test_the_likeliest_order_is_found():
+    plan = planned("pick up the red key and put the red box next to the red key")
+    assert [step.text.split()[0] for step in plan.steps] == ["put", "pick"]  # with full hands nothing is put
+    assert plan.probability == pytest.approx(0.99**2) and "(99%)" in str(plan)
+    plan = planned("pick up the red key, then go to the red box")
+    assert [step.text for step in plan.steps] == ["pick up the red key", "go to the red box"]
+
+
+def test_an_open_argument_is_chosen():
+    assert planned("go to the red box, then go to the key").steps[1].text == "go to the red key"
+
+
+def test_what_is_left_of_a_plan_is_planned_anew():
+    search = SkillSearch(library_of())
+    groups = search.instructions_of("go to the red box and pick up the red key, then go to the blue box")
+    plan = search.plan(groups, {"hand": torch.zeros(1, 1)})
+    assert undone(plan, 0, groups) == groups and len(undone(plan, 1, groups)[0]) == 1
+    assert undone(plan, 2, groups) == groups[1:] and undone(plan, 3, groups) == ()
+
+
+@pytest.mark.parametrize(
+    "goal, said",
+    [
+        ("go to the crimson box", "do not know 'crimson' in"),
+        (
+            "pick up the red key, then pick up the blue key",
+            "the best, pick up the red key .99%., then pick up the blue key .1%.",
+        ),
+        ("put the key", "no skill does 'put the key'. There are: go to the _ _; "),
+        (",", "say what to do"),
+    ],
+)
+def test_goals_that_cannot_be_planned_are_named_in_a_sentence(goal, said):
+    with pytest.raises(PlanningError, match=said):
+        planned(goal)
+
+
+def test_a_library_is_written_renamed_and_read(tmp_path):
+    library = library_of(SkillLibrary)
+    library.write(tmp_path)
+    library.renamed("go to the _ _", "walk").tried("walk", 2, 0).write_names(tmp_path)
+    read = SkillLibrary.load(tmp_path)
+    assert read.named("walk").tries == 100 and read.named("walk").works == pytest.approx(99 / 102)
+    seen, texts = {"hand": torch.zeros(2, 1)}, ["go to the red key", "pick up the blue box"]
+    assert torch.allclose(read.outlook(seen, texts).begins, library.outlook(seen, texts).begins)
+    assert read.end_texts == library.end_texts and read.skill_of("go to the red key").name == "walk"
+    with pytest.raises(PlanningError, match="no skill 'wolk'; did you mean 'walk'"):
+        read.named("wolk")
+    with pytest.raises(PlanningError, match="no free name"):
+        read.renamed("walk", "pick up the _ _")
+    with pytest.raises(CheckpointError, match="holds no skills"):
+        SkillLibrary.load(tmp_path / "fast")

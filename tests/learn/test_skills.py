@@ -1,0 +1,172 @@
+"""Skills learned from long recordings: segments by instruction, their ends, and plans of several steps, from the command line."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tests.learn.stopping import quiet
+from tests.learn.test_imitation import QUICK, teacher
+
+import terrella
+from terrella.act.skills.actor import SkillActor
+from terrella.cli import main
+from terrella.core.world import make_rng
+from terrella.data import record
+from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
+from terrella.learn.recipes.skills import Segments
+from terrella.sim.gymnasium import GymnasiumWorld
+
+NAME = "gym:tests.learn.test_skills:TerrellaErrands-v0"
+BOTH = "gym:tests.learn.test_skills:TerrellaBoth-v0"
+
+
+class Errands(gymnasium.Env):
+    """Two of seven cells hold a code; the mission names the one to step on, and then the other. Three errands are an episode."""
+
+    action_space = spaces.Discrete(3)  # left, stay, right
+    observation_space = spaces.Dict({"grid": spaces.Box(0, 9, (1, 7, 1), np.uint8), "mission": spaces.Text(80)})
+    metadata = {"render_modes": ["ansi"], "render_fps": 10}
+    errands, words = 3, "go to the {} ball"
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cells = dict(zip(("red", "blue"), self.np_random.permutation([0, 6]).tolist()))
+        first = str(self.np_random.choice(["red", "blue"]))
+        self.wanted = [first, "blue" if first == "red" else "red", first][: self.errands]
+        self.mission = self.words.format(*self.wanted)
+        self.at, self.steps = int(self.np_random.integers(2, 5)), 0
+        return self.seen(), {}
+
+    def step(self, action):
+        self.at, self.steps = int(np.clip(self.at + int(action) - 1, 0, 6)), self.steps + 1
+        if self.at == self.cells[self.wanted[0]]:
+            self.wanted = self.wanted[1:]
+            self.mission = self.words.format(*self.wanted) if self.wanted and self.errands == 3 else self.mission
+        return self.seen(), float(not self.wanted), not self.wanted, self.steps >= 40, {}
+
+    def seen(self):
+        grid = np.zeros((1, 7, 1), np.uint8)
+        grid[0, [self.cells["red"], self.cells["blue"]], 0] = (3, 5)
+        grid[0, self.at, 0] += 1
+        return {"grid": grid, "mission": self.mission}
+
+
+class Both(Errands):
+    """One mission of two steps."""
+
+    errands, words = 2, "go to the {} ball, then go to the {} ball"
+
+
+for name, kind in {"TerrellaErrands-v0": Errands, "TerrellaBoth-v0": Both}.items():
+    if name not in gymnasium.registry:
+        gymnasium.register(name, kind)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """(the folder of a library, the recording that it is from, the policy, what learning printed)"""
+    folder = tmp_path_factory.mktemp("skills")
+    world = GymnasiumWorld(Errands)
+    record(
+        world, terrella.load_policy(f"{teacher.__module__}:teacher", world.spec), folder / "recording", 600, make_rng(0)
+    )
+    imitation = Imitation(remember=16)
+    train_imitation(folder / "recording", folder / "run", replace(QUICK, steps=120), imitation, quiet)
+    return folder / "library", folder / "recording", folder / "run"
+
+
+def learned(library, *further):
+    out, recording, policy = library
+    words = [
+        "skills",
+        "learn",
+        str(recording),
+        "--policy",
+        str(policy),
+        "--out",
+        str(out),
+        "--steps",
+        "150",
+        "--batch",
+        "32",
+    ]
+    return main([*words, *further])
+
+
+def test_skills_are_learned_from_long_recordings_and_planned_with(library, capsys):
+    opened, _ = open_demonstrations(library[1], ("grid",), (64, 64), quiet)
+    segments = Segments.of(opened)
+    assert len(segments.first) > 2.5 * len(opened.cache.episodes) and segments.success[:-1].all()
+    assert learned(library, "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [one["phrase"] for one in facts["skills"]] == ["go to the blue|red ball"]
+    assert facts["ends_recognised"] > 0.9 and facts["ended_too_early"] < 0.1
+    folder = str(library[0])
+    assert main(["plan", BOTH, "--skills", folder, "--episodes", "12", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["rewarded"]["value"] > 0.8 and len(result["episodes"][0]["events"]) >= 3
+    goal = "go to the blue ball, then go to the red ball, then go to the blue ball"
+    assert main(["plan", NAME, "--skills", folder, "--goal", goal, "--episodes", "3"]) == 0
+    assert "go to the blue ball, then go to the red ball" in capsys.readouterr().out
+    assert (
+        main(
+            [
+                "evaluate",
+                folder,
+                "--in",
+                BOTH,
+                "--success",
+                "reward",
+                "--episodes",
+                "8",
+                "--json",
+                "--out",
+                folder + "/e",
+            ]
+        )
+        == 0
+    )
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows["library"]["dream"]["value"] > 0.8
+
+
+def test_a_skill_is_renamed_tried_and_listed(library, capsys):
+    assert learned(library) == 0
+    folder = str(library[0])
+    assert main(["skills", "rename", folder, "go to the _ ball", "walk"]) == 0
+    assert main(["skills", "try", folder, "walk", "--in", NAME, "--episodes", "4"]) == 0
+    assert "'walk' works in" in capsys.readouterr().out
+    assert main(["skills", "list", folder]) == 0
+    assert "walk" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (["--goal", "go to the crimson ball"], "do not know 'crimson'"),
+        (["--goal", "go"], "no skill does 'go'"),
+        (["--goal", "go to the red ball", "--proposal", "x"], "--proposal: plans of skills have no use"),
+    ],
+)
+def test_goals_that_no_skill_reaches_are_refused_before_acting(library, words, said, capsys):
+    assert learned(library) == 0
+    assert main(["plan", NAME, "--skills", str(library[0]), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_an_actor_of_many_episodes_is_as_of_each_alone(library):
+    assert learned(library) == 0
+    world = GymnasiumWorld(Both)
+    actor = terrella.load_policy(str(library[0]), world.spec)
+    assert isinstance(actor, SkillActor)
+    seen = [world.render(world.start(1, make_rng(n)), actor.sees) for n in (1, 2)]
+    together = {name: torch.cat([one[name] for one in seen]) for name in actor.sees}
+    many, _ = actor.act(together, actor.begin(2, make_rng(0)), make_rng(0))
+    alone = [actor.act(one, actor.begin(1, make_rng(0)), make_rng(0))[0] for one in seen]
+    assert many.tolist() == torch.cat(alone).tolist()
