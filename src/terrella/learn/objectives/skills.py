@@ -10,7 +10,9 @@ import torch.nn.functional as F
 
 from ...act.imitation_network import ImitationNetwork
 from ...act.skills.predictor import SkillPredictor
-from ..trainer import Loss, TrainStep, adamw, warmup_cosine
+from ..learners import adamw, warmup_cosine
+from ..train_step import TrainStep
+from ..trainer import Loss
 
 
 @dataclass(frozen=True)
