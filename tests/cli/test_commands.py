@@ -278,6 +278,14 @@ def test_an_environment_without_its_gym_is_recognised(capsys):
     assert "did you mean 'gym:CartPole-v1'?" in refusal(["learn", "CartPole-v1"], capsys)
 
 
+def test_a_path_that_begins_with_a_dash_is_recognised(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "-film.mp4").touch()
+    with pytest.raises(SystemExit):
+        main(["data", "convert", "-film.mp4", "out"])
+    assert "write ./-film.mp4" in capsys.readouterr().err
+
+
 def test_a_command_of_a_group_is_recognised_without_it(capsys):
     assert "did you mean 'data convert'?" in refusal(["convert", "here"], capsys)
     assert "did you mean 'data doctor'?" in refusal(["doctor"], capsys)

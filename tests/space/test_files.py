@@ -146,7 +146,7 @@ COLOURS = {
     "floats to 255": ("r g b", "<f4", [204.0, 102.0, 51.0]),
     "16 bits": ("diffuse_red diffuse_green diffuse_blue", ">u2", [52428, 26214, 13107]),
     "bytes": ("red green blue", "u1", [204, 102, 51]),
-    "integers to 255": ("red green blue", "<i4", [204, 102, 51]),
+    "integers to 255": ("Red Green Blue", "<i4", [204, 102, 51]),
 }
 
 

@@ -263,6 +263,15 @@ COLOURS = {
 }
 
 
+def test_a_picture_beside_the_file_may_differ_in_capitals_and_scenes_may_be_absent(tmp_path):
+    (tmp_path / "Tex").mkdir()
+    Image.fromarray(FOUR).save(tmp_path / "Tex" / "A.PNG")
+    more = {"images": [{"uri": "tex\\a.png"}], "scenes": []}
+    scene = textured(tmp_path, **more)
+    assert [colour_at(scene, *quarter) for quarter in QUARTERS] == [[round(c / 255) for c in one] for one in PLAIN]
+    assert scene.names == ("floor",) and not scene.left_out
+
+
 @pytest.mark.parametrize("kind", COLOURS)
 def test_vertex_colours_of_every_type(tmp_path, kind):
     file = File()

@@ -348,6 +348,12 @@ def test_bad_pictures_are_one_sentence_and_leave_no_world(tmp_path, capsys, dama
     assert why in said and "Traceback" not in said and not (tmp_path / "run" / "world").exists()
 
 
+def test_a_folder_of_another_tool_is_told_how_it_becomes_posed_pictures(tmp_path, capsys):
+    saved(tmp_path, "keyframes/images/1.jpg")  # as Polycam exports
+    assert main(["space", "fit", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
+    assert "transforms.json names them (nerfstudio's ns-process-data" in capsys.readouterr().err
+
+
 def test_huge_pictures_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("terrella.space.pictures.reading.MOST_PIXELS", 1000)
     Image.new("RGB", (60, 60)).save(tmp_path / "a.png")

@@ -149,7 +149,7 @@ def _run(given: list[str]) -> int:
 
     import tyro
 
-    from .flags import value_of_flag
+    from .flags import dashed_path, value_of_flag
     from .help_page import help_page
 
     module, _, function = COMMANDS[name][0].partition(":")
@@ -169,7 +169,7 @@ def _run(given: list[str]) -> int:
     try:
         return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
     except SystemExit as stop:
-        if stop.code == 2 and (sentence := value_of_flag(command, words)):
+        if stop.code == 2 and (sentence := value_of_flag(command, words) or dashed_path(words)):
             print(f"terrella: {sentence}", file=sys.stderr)
         raise
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from tyro.conf import Positional
@@ -28,6 +29,14 @@ def value_of_flag(command: Callable[..., Any], words: Sequence[str]) -> str:
             instead = f"; {INSTEAD[flag]}" if flag in INSTEAD else "; leave the value out"
             return f"{flag} takes no value{instead}."
     return ""
+
+
+def dashed_path(words: Sequence[str]) -> str:
+    """One sentence if a word is a path that begins with a dash, which is taken for an option, else ""."""
+    return next(
+        (f"the name {one} begins with a dash: write ./{one}" for one in words if one[:1] == "-" and Path(one).exists()),
+        "",
+    )
 
 
 def _hints(command: Callable[..., Any], **options: Any) -> list[Any]:

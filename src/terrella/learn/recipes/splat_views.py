@@ -12,6 +12,7 @@ from safetensors.torch import save_file
 
 from ...core.errors import DatasetError
 from ...data import Dataset
+from ...data.format import INFO
 from ...space.camera import FAR_M
 from ...space.files import replace_whole
 from ...space.fitting import FitConfig, PosedViews
@@ -50,6 +51,12 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
         views, dull = to_views(shots, config.longest)
         points, left_out = shots.points * config.scale, sorted({*unplaced, *dull})
     else:
+        if path.is_dir() and not (path / INFO).exists():
+            raise DatasetError(
+                f"{data} is no recording (it has no {INFO}) and no folder of pictures: those lie in it themselves, or a "
+                "transforms.json names them (nerfstudio's ns-process-data makes one of exports of Polycam and Record3D), or "
+                "COLMAP's model."
+            )
         views, spec = _recorded(data, config)
         points = None
     pose = torch.cat([views.pose[:, :3] * config.scale, views.pose[:, 3:]], 1)

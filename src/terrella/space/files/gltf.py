@@ -194,9 +194,20 @@ def _of_uri(uri: Any, folder: Path) -> bytes:
         except binascii.Error as error:
             raise ValueError(f"what it holds as text is broken ({error})") from error
     for name in dict.fromkeys([unquote(str(uri)), str(uri), unquote(str(uri)).replace("\\", "/")]):
-        if not Path(name).is_absolute() and ".." not in Path(name).parts and (folder / name).is_file():
-            return (folder / name).read_bytes()
+        if not Path(name).is_absolute() and ".." not in Path(name).parts and (file := _beside(folder, name)):
+            return file.read_bytes()
     raise FileNotFoundError(f"it lacks the file {str(uri)[:80]!r} beside it; export it as one .glb")
+
+
+def _beside(folder: Path, name: str) -> Path | None:
+    """The file of that name in a folder; where there is none, one whose name differs in capitals alone."""
+    if (folder / name).is_file():
+        return folder / name
+    here = [folder]
+    for part in Path(name).parts:
+        inside = (one for at in here if at.is_dir() for one in sorted(at.iterdir()))
+        here = [one for one in inside if one.name.casefold() == part.casefold()]
+    return next((one for one in here if one.is_file()), None)
 
 
 def _whole(about: dict[str, Any], name: str, usual: int | None = None) -> int:

@@ -89,7 +89,7 @@ def _nodes(file: Gltf, whole: np.ndarray) -> Iterator[tuple[int, dict[str, Any],
     about = file.about
     if len(about.get("nodes", [])) > MOST_NODES:
         raise ValueError(f"it has {len(about['nodes']):,} nodes, {MOST_NODES:,} is the most")
-    if "scenes" in about:
+    if about.get("scenes"):
         roots = file.named("scenes", about.get("scene", 0)).get("nodes", [])
     else:
         inner = {child for node in about.get("nodes", []) for child in node.get("children", [])}

@@ -69,7 +69,13 @@ def _header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]
             if len(words) != 3 or words[1] not in _TYPES or not tables or len(tables[-1][2]) >= 1000:
                 raise ValueError(f"its property line '{' '.join(words)[:80]}' is not understood")
             tables[-1][2].append((words[2], _ORDERS[form] + _TYPES[words[1]]))
-    return form, tables, mark.end()
+    return form, [(name, count, _in_small_letters(columns)) for name, count, columns in tables], mark.end()
+
+
+def _in_small_letters(columns: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Columns with names in small letters (X, Red), where these differ."""
+    small = [(name.lower(), kind) for name, kind in columns]
+    return small if len(dict(small)) == len(small) else columns
 
 
 def _rows(data: bytes, at: int, kinds: list[tuple[str, int, np.dtype]]) -> dict[str, np.ndarray]:
