@@ -1,7 +1,7 @@
 """BabyAI by imitation: one policy for several levels, from the bot's demonstrations, judged on missions and on words never seen.
 
     python lab/babyai.py demonstrate OUT.npz GoToObj:800 GoToLocal:3000 PickupLoc:2500
-    python lab/babyai.py train OUT.npz RUN 50            # minutes
+    python lab/babyai.py train OUT.npz RUN 50            # minutes; several files with commas between
     python lab/babyai.py judge RUN GoToObj GoToLocal PickupLoc --missions 512
     python lab/babyai.py skills OUT.npz RUN LIBRARY      # a library of skills
     python lab/babyai.py compose LIBRARY GoTo Synth --missions 300   # three steps by skills and by the flat policy
@@ -10,6 +10,7 @@ It needs `pip install minigrid`. Demonstrations go into arrays at once: recordin
 longer than the game.
 """
 
+import signal
 import sys
 import warnings
 from collections.abc import Callable
@@ -21,7 +22,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from terrella.act.imitation import ImitationActor
+from terrella.act.imitation import ImitationActor, load_imitation_network
 from terrella.act.imitation_network import ImitationNetwork
 from terrella.act.skills.actor import SkillActor
 from terrella.act.skills.library import SkillLibrary
@@ -41,6 +42,7 @@ from terrella.measure.statistics import wilson
 from terrella.sim.gymnasium import GymnasiumWorld
 
 INSTRUCTIONS, MOST_STEPS = 4, 64  # of a long demonstration, and steps of each at most
+PATIENCE_S = 1.0  # of a decision of the bot
 SLIPS = 0.1  # probability of a random action of the teacher
 PARAPHRASES = (  # three wordings of each mission; training has seen none of them
     {"go to": "walk over to", "pick up": "grab", "put": "place", "next to": "beside"},
@@ -53,6 +55,7 @@ def demonstrate(out: str, levels: list[str]) -> None:
     """Arrays of all episodes of these levels (NAME:EPISODES). Of Chain they are long: INSTRUCTIONS follow each other in a room."""
     rows = {name: [] for name in ("image", "direction", "action", "advice", "valid", "task", "reward")}
     tasks, ranges, rng = {}, [], np.random.default_rng(0)
+    signal.signal(signal.SIGALRM, _out_of_time)
     for level in levels:
         name, _, count = level.partition(":")
         env = room_of(lambda room: room.sample(("go", "put", "pick"))) if name == "Chain" else None
@@ -74,6 +77,10 @@ def demonstrate(out: str, levels: list[str]) -> None:
     np.savez_compressed(out, ranges=ranges, tasks=list(tasks), **{key: np.array(value) for key, value in rows.items()})
 
 
+def _out_of_time(*_) -> None:
+    raise TimeoutError
+
+
 def _carried_out(env, seen, rows, tasks, rng) -> tuple:
     """(the observation after the instruction of `env`, whether it was carried out)"""
     from minigrid.utils.baby_ai_bot import BabyAIBot
@@ -86,9 +93,12 @@ def _carried_out(env, seen, rows, tasks, rng) -> tuple:
                 advice = 0 if env.grid.get(*env.front_pos) else 4  # turn left, or drop it
             else:
                 bot, last = (BabyAIBot(env), None) if bot is None else (bot, last)
+                signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)  # with full hands and no way it plans for ever
                 advice = int(bot.replan(last))
         except Exception:  # the bot lost its plan
             advice = int(rng.integers(7))
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         last = int(rng.integers(7)) if rng.random() < SLIPS else advice
         seen, reward, ended, cut, _ = env.step(last)
         _add_action(rows, last, advice, reward)
@@ -139,13 +149,16 @@ def opened(files: str) -> Recording:
     return Recording(cache, start, usable, controls_of(cache), None, tuple(held))
 
 
-def train(file: str, out: str, minutes: float, remember: int = 24, seed: int = 0) -> None:
+def train(file: str, out: str, minutes: float, remember: int = 24, seed: int = 0, begin: str = "") -> None:
+    """begin: a policy of the same vocabulary whose weights it goes on from."""
     recording = opened(file)
-    practice = Practice(batch=64 if remember else 128, learning_rate=2e-3, seed=seed)
+    practice = Practice(batch=64 if remember else 128, learning_rate=1e-3 if begin else 2e-3, seed=seed)
     torch.manual_seed(seed)
     network = ImitationNetwork(config_of(recording, ("image", "direction"), 128, Imitation(remember=remember)))
     rows = DemonstrationRows.of(recording, network.config, torch.device("cpu"))
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
+    if begin:
+        network.load_state_dict(load_imitation_network(begin)[0].state_dict())
     run = Run.of(out, practice, lambda done, total, text: print(text, flush=True), recording=file, remember=remember)
     feed = RandomBatches(lambda now: rows.sample(practice.batch, now.rng))
     trainer = Trainer(run, "imitation", feed, BehaviourCloning(network, practice.learning_rate), ENDLESS)
@@ -274,7 +287,7 @@ if __name__ == "__main__":
     if what == "demonstrate":
         demonstrate(target, rest)
     elif what == "train":
-        train(target, rest[0], float(rest[1]), *map(int, rest[2:]))
+        train(target, rest[0], float(rest[1]), *map(int, rest[2:4]), *rest[4:])
     elif what == "skills":
         skills(target, *rest)
     else:

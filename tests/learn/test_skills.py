@@ -16,11 +16,13 @@ from tests.learn.test_imitation import QUICK, teacher
 import terrella
 from terrella.act.skills.actor import SkillActor
 from terrella.cli import main
+from terrella.core.errors import PlanningError
 from terrella.core.world import make_rng
 from terrella.data import record
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
 from terrella.learn.recipes.skills import Segments
 from terrella.sim.gymnasium import GymnasiumWorld
+from terrella.workflows.page_agents import PageAgents
 
 NAME = "gym:tests.learn.test_skills:TerrellaErrands-v0"
 BOTH = "gym:tests.learn.test_skills:TerrellaBoth-v0"
@@ -158,6 +160,19 @@ def test_goals_that_no_skill_reaches_are_refused_before_acting(library, words, s
     assert learned(library) == 0
     assert main(["plan", NAME, "--skills", str(library[0]), *words]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_person_types_a_goal_of_several_steps_on_the_page(library):
+    assert learned(library) == 0
+    world = GymnasiumWorld(Errands)
+    agents = PageAgents(world, name=str(library[0])).agents()
+    state = world.start(1, make_rng(3))
+    goal = "go to the blue ball, then go to the red ball"
+    agent = agents.make(agents.words(goal))
+    _, memory = agent.policy.act(agent.see(state), agent.policy.begin(1, make_rng(0)), make_rng(0))
+    assert memory[0].goal == goal and [step.text for step in memory[0].plan.steps] == goal.split(", then ")
+    with pytest.raises(PlanningError, match="no skill does 'ball ball'"):
+        agents.words("ball ball")
 
 
 def test_an_actor_of_many_episodes_is_as_of_each_alone(library):

@@ -25,6 +25,8 @@ from ..act.planning import (
 )
 from ..act.policies_by_name import NoisyPolicy
 from ..act.sentences import words_of
+from ..act.skills.actor import SkillActor
+from ..act.skills.library import KIND as SKILLS
 from ..core.errors import PlanningError
 from ..core.instruction import bytes_to_text, text_to_bytes
 from ..core.policy import observed_channels
@@ -35,6 +37,7 @@ from ..serve.agent import Agent, Agents, Futures
 from .goals import state_channel, with_estimated_pose
 
 TEXT_CHANNEL = "text"
+INSTRUCTED = (ImitationActor, SkillActor)
 _REPLAN_S = 0.06  # world time for which a plan is executed before the next is made
 _NEAR = 0.05  # share of a range within which a goal is reached
 _SHOWN = ("pose", "places")  # channels by which routes are planned, beside those that a planner's world observes
@@ -75,7 +78,7 @@ class PageAgents:
         plans = policy.policy if isinstance(policy, NoisyPolicy) else policy
         if isinstance(plans, Planner):
             return Agent(self.name, policy, self.see, futures=self._futures(plans) if plans is policy else None)
-        if isinstance(policy, ImitationActor) and TEXT_CHANNEL in policy.sees:
+        if isinstance(policy, INSTRUCTED) and TEXT_CHANNEL in policy.sees:
             return Agent(self.name, policy, self._see_with(policy))
         sees = observed_channels(policy, self.played.spec)
         return Agent(self.name, policy, lambda state: self.played.render(state, sees))
@@ -86,18 +89,21 @@ class PageAgents:
     def _spec(self) -> Spec:
         """The spec for the policy: where the world gives no instructions to one that imitates, the person may."""
         spec, folder = self.played.spec, policy_folder(self.name)
-        if not folder.is_dir() or read_policy(folder).get("kind") != KIND:
+        if not folder.is_dir() or read_policy(folder).get("kind") not in (KIND, SKILLS):
             return spec
         return replace(spec, channels={**spec.channels, TEXT_CHANNEL: TEXT})
 
     @cached_property
     def _follows_instructions(self) -> bool:
         policy = self.make({}).policy if self.name not in ("", "plan") else None
-        return isinstance(policy, ImitationActor) and TEXT_CHANNEL in policy.sees
+        return isinstance(policy, INSTRUCTED) and TEXT_CHANNEL in policy.sees
 
     def _instruction(self, words: str) -> Observation:
-        """The instruction as a goal. PlanningError if the policy knows none of its words."""
+        """The instruction as a goal. PlanningError if the policy knows none of its words, or no plan of skills does it."""
         policy = library.load_policy(self.name, self._spec, self.world)
+        if isinstance(policy, SkillActor):
+            policy.search.instructions_of(words)
+            return {TEXT_CHANNEL: torch.from_numpy(text_to_bytes(words).copy())[None]}
         assert isinstance(policy, ImitationActor)
         if len(policy.unknown(words)) == len(set(words_of(words))):
             known = ", ".join(policy.network.config.vocabulary)
@@ -107,12 +113,14 @@ class PageAgents:
     def _instructed(self, text: torch.Tensor) -> Agent:
         """The policy with this instruction [1, TEXT_BYTES] in place of the world's own. The agent's name tells what it ignores."""
         policy = library.load_policy(self.name, self._spec, self.world)
-        assert isinstance(policy, ImitationActor)
+        assert isinstance(policy, INSTRUCTED)
         unknown = ", ".join(f"'{word}'" for word in policy.unknown(bytes_to_text(text[0].numpy())))
         name = f"{self.name} (does not know {unknown})" if unknown else self.name
         return Agent(name, policy, self._see_with(policy, text))
 
-    def _see_with(self, policy: ImitationActor, text: torch.Tensor | None = None) -> Callable[[State], Observation]:
+    def _see_with(
+        self, policy: ImitationActor | SkillActor, text: torch.Tensor | None = None
+    ) -> Callable[[State], Observation]:
         """What the policy sees: of the world, with this instruction, or with an empty one where the world has none."""
         given = text is not None or TEXT_CHANNEL not in self.played.spec.channels
         text = torch.zeros(1, *shape_of(TEXT), dtype=torch.uint8) if text is None else text
