@@ -75,6 +75,7 @@ class PhysicsReport:
     coarse_horizon: Figure  # the same with the coarse tolerances
     change: Figure | None  # how far bodies go in a step, over that of the truth: 0 is frozen
     worst: WorstRollout | None = field(default=None, repr=False)
+    notes: tuple[str, ...] = ()  # what a reader of the figures should know
 
 
 def examine_physics(
@@ -171,7 +172,7 @@ def physics_verdict(report: PhysicsReport) -> list[str]:
     if report.change is not None:
         lines.append(f"bodies go {report.change.value:.2f} times as far as in the truth (0 would be frozen).")
     lines += [f"{one.name}: {one.wrong_here}." for one in report.laws if one.wrong_here]
-    return lines
+    return [*lines, *report.notes]
 
 
 def _times(ratio: float) -> str:

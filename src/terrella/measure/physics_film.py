@@ -50,7 +50,7 @@ def _plane(motion: Trajectory) -> tuple[int, int]:
 
 
 def _window(motion: Trajectory, across: int, up: int) -> tuple[torch.Tensor, torch.Tensor]:
-    places = motion.position[:, 0][..., [across, up]].reshape(-1, 2)
+    places = motion.position[:, 0][motion.present[:, 0]][:, [across, up]]
     margin = 2 * float((motion.size + motion.half.norm(dim=-1))[:, 0].max())
     return places.amin(0) - margin, places.amax(0) + margin
 

@@ -113,6 +113,9 @@ class PhysicalSystem:
     bounds_m: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """The box (low corner, high corner) that bodies never leave."""
     hidden: tuple[str, ...] = ()  # moving parts that touch bodies and that no channel holds
+    tracked: bool = (
+        False  # velocities are measured from positions, so those beside a contact may be of either side of it
+    )
 
     def __post_init__(self):
         names = [body.name for body in self.bodies]

@@ -131,6 +131,11 @@ class Trajectory:
     def clear(self) -> Tensor:
         """bool [T, B, N]: nothing but gravity acts on the body within the step."""
         touched = self.walls_touched.any(-1) | self.bodies_touched.any(-1)
+        if self.system.tracked:
+            beside = touched.clone()
+            beside[1:] |= touched[:-1]
+            beside[:-1] |= touched[1:]
+            touched = beside
         return ~touched & self.both_present & ~self.driven & ~self.tied
 
     @cached_property

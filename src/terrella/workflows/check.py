@@ -19,14 +19,13 @@ from ..measure.physics import COARSE, PhysicsReport, examine_physics, physics_ve
 from ..measure.physics_page import physics_page
 from ..measure.rollouts import StepMetric, dream
 from ..physics import PhysicalSystem, Trajectory, trajectory_of
+from .check_pictures import CONTEXT, EDGE, RECORDED, check_scale, motions_in_pictures, needs_pictures
 from .opening import Device, load_named
 from .progress import Progress, silent
 from .results import folder_name, jsonable, table_lines
 from .score import open_cache
 
-CONTEXT = 4  # rows that a world observes before it predicts
 KNOWN = 600  # true rollouts at most, two thirds of them for calibration
-RECORDED = "recorded"
 
 
 @dataclass(frozen=True)
@@ -38,6 +37,10 @@ class CheckConfig:
     """Where bodies, walls and limits are described: a JSON file, or the name of a simulator. Default: the recording, as Terrella
     records it, else the world."""
     out: Path | None = None  # Folder for check.json and check.html. Default: checks/WORLD.
+    pictures: bool = False
+    """Judge what the pictures show, even where the world has numbers: things are tracked. Default: only where it has none."""
+    metres_per_pixel: float | None = None
+    """The size of a pixel, for pictures. Default: fitted to recorded positions, else to things that fall freely."""
     rollouts: int = 60  # Rollouts of the world.
     steps: int = 32  # Steps of a rollout.
     coarse: float = COARSE
@@ -81,27 +84,39 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
     bodies, a channel that is missing, a recording that is too short."""
     if min(config.rollouts, config.steps) < 2 or not 0 <= config.coarse <= 1:
         raise TerrellaError("--rollouts and --steps are 2 or more, and --coarse is from 0 to 1.")
+    check_scale(config.metres_per_pixel)
     opened = load_named(world, config.device, progress=progress)
     cache = open_cache(config.data, opened, progress)
     system = system_named(config.system, cache.world.get("system"), opened.spec)
-    opened.spec.check_channels(system.channels)
+    pictures = config.pictures or needs_pictures(system, opened.spec)
+    if not pictures:
+        opened.spec.check_channels(_described(system, config.system).channels)
+    elif not opened.spec.kinds("rgb"):
+        raise TerrellaError(f"{world} shows no pictures; leave --pictures out.")
     train, held_out = split(len(cache.episodes))
     every = list(range(len(cache.episodes)))
     chosen, rng = every if config.fresh else held_out, make_rng(config.seed)
     if not chosen or not train:
         raise DatasetError(f"{config.data} has one episode, and a check needs two or more; record more.")
-    clips = clips_from_cache(cache, chosen, CONTEXT, config.steps, config.rollouts, rng)
+    length = config.steps + (EDGE if pictures else 0)
+    clips = clips_from_cache(cache, chosen, CONTEXT, length, config.rollouts, rng)
     apart = [number for number in every if number not in chosen] or every
-    known = clips_from_cache(cache, apart, CONTEXT, config.steps, KNOWN, rng)
+    known = clips_from_cache(cache, apart, CONTEXT, length, KNOWN, rng)
     if (count := 2 * len(known) // 3) < 99:
         progress(
             f"{count} true rollouts calibrate the tolerances: up to {1 / (count + 1):.1%} false alarms; 99 give 1%, so "
             "record more or take fewer --steps."
         )
-    truth, others = (_true_motion(system, some, opened.spec) for some in (clips, known))
-    mine = dream_motion(opened, system, clips, config.steps, make_rng(config.seed))
+    notes, chance = (), make_rng(config.seed)
+    if pictures:
+        seen = motions_in_pictures(opened, system, clips, known, config.metres_per_pixel, chance)
+        others, truth, mine, notes = seen.known, seen.truth, seen.dream, (seen.note,)
+    else:
+        described = _described(system, config.system)
+        truth, others = (_true_motion(described, some, opened.spec) for some in (clips, known))
+        mine = dream_motion(opened, described, clips, config.steps, chance)
     report = examine_physics(opened.spec.name, others, truth, mine, config.seed, config.coarse)
-    return _written(report, config.out or Path("checks") / folder_name(world))
+    return _written(dataclasses.replace(report, notes=notes), config.out or Path("checks") / folder_name(world))
 
 
 def _written(report: PhysicsReport, out: Path) -> CheckResult:
@@ -113,19 +128,23 @@ def _written(report: PhysicsReport, out: Path) -> CheckResult:
     return result
 
 
-def system_named(given: str | None, recorded: Any, spec: Spec) -> PhysicalSystem:
-    """The system in a JSON file, of a simulator, of the recording, or of the world, in this order. TerrellaError without any."""
+def system_named(given: str | None, recorded: Any, spec: Spec) -> PhysicalSystem | None:
+    """The system in a JSON file, of a simulator, of the recording, or of the world, in this order; None without any."""
     if given is not None and library.is_truth(given):
         recorded = library.load(given).spec.system
     elif given is not None:
         return PhysicalSystem.read(given)
     facts = recorded or spec.system
-    if not facts:
+    return PhysicalSystem.from_json(facts) if facts else None
+
+
+def _described(system: PhysicalSystem | None, given: str | None) -> PhysicalSystem:
+    if system is None:
         raise TerrellaError(
             f"neither {given or 'the recording nor the world'} describes its bodies; give --system with a JSON file "
             "(docs/physics.md), or with the simulator that was recorded."
         )
-    return PhysicalSystem.from_json(facts)
+    return system
 
 
 def _true_motion(system: PhysicalSystem, clips: list[Clip], spec: Spec) -> Trajectory:

@@ -46,7 +46,7 @@ class Continuity:
         return SINGLE * float(motion.position.abs().max().clamp_min(1.0))
 
     def ceiling(self, motion: Trajectory) -> float:
-        return float(motion.size.mean())
+        return float(motion.size[motion.present].mean())
 
     def violate(self, motion: Trajectory, size: float, seeds: Tensor) -> tuple[Trajectory, Tensor]:
         step, body, some = occasions(motion.both_present, seeds)

@@ -33,7 +33,7 @@ class NonPenetration:
         return SINGLE * float(motion.position.abs().max().clamp_min(1.0))
 
     def ceiling(self, motion: Trajectory) -> float:
-        return 0.5 * float(motion.size.amin())
+        return 0.5 * float(motion.size[motion.present].amin())
 
     def violate(self, motion: Trajectory, size: float, seeds: Tensor) -> tuple[Trajectory, Tensor]:
         step, body, some = occasions(motion.both_present, seeds)

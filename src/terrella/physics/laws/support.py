@@ -57,6 +57,8 @@ class Support:
     def missing(self, system: PhysicalSystem) -> str:
         if not any(wall.normal is not None for wall in system.walls):
             return "needs a floor (a wall with a normal)"
+        if system.tracked:
+            return "needs velocities in a channel: those of tracks do not say in which step a bounce was"
         tied = {rod.body for rod in system.rods}
         if not [body for body in system.bodies if not body.driven and body.name not in tied]:
             return "needs a body that nothing drives or holds"
