@@ -141,8 +141,8 @@ class Tracker:
         pair = self.colours[torch.stack([colour[label[both]], colour[other[both]]], 1)] - behind[:, None]  # [Q, 2, 3]
         mixed = torch.linalg.lstsq(pair.transpose(1, 2), (values - behind)[..., None]).solution[..., 0].clamp(0, 1)
         weight[both] = mixed[:, 0]
-        places = tuple(torch.cat([part, part[both]]) for part in (frame, y, x))
-        return places, torch.cat([label, other[both]]), torch.cat([weight, mixed[:, 1]]).double(), colour
+        frame, y, x = (torch.cat([part, part[both]]) for part in (frame, y, x))
+        return (frame, y, x), torch.cat([label, other[both]]), torch.cat([weight, mixed[:, 1]]).double(), colour
 
 
 def fit_tracker(pictures: Tensor) -> Tracker:
