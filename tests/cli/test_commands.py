@@ -37,7 +37,7 @@ OPTIONS = {
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
-    "--momentum --no-curve --out --proposal --randomise --real --replan --samples --search "
+    "--momentum --no-curve --out --proposal --randomise --real --replan --rollouts --samples --search "
     "--seed --size --skills --spread --steps --success --task --temperature --trust --within",
     "skills learn": "--batch --json --learning-rate --out --policy --save-every-s --seed --steps",
     "skills list": "--json",

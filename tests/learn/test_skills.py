@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from tests.learn.stopping import quiet
-from tests.learn.test_imitation import QUICK, teacher
+from tests.learn.test_imitation import COLOURS, QUICK, teacher
 
 import terrella
 from terrella.act.skills.actor import SkillActor
@@ -38,25 +38,23 @@ class Errands(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.cells = dict(zip(("red", "blue"), self.np_random.permutation([0, 6]).tolist()))
-        first = str(self.np_random.choice(["red", "blue"]))
-        self.wanted = [first, "blue" if first == "red" else "red", first][: self.errands]
-        self.mission = self.words.format(*self.wanted)
+        self.cells = self.np_random.permutation([0, 6])  # of red and blue
+        self.first, self.done = int(self.np_random.integers(2)), 0
         self.at, self.steps = int(self.np_random.integers(2, 5)), 0
         return self.seen(), {}
 
     def step(self, action):
         self.at, self.steps = int(np.clip(self.at + int(action) - 1, 0, 6)), self.steps + 1
-        if self.at == self.cells[self.wanted[0]]:
-            self.wanted = self.wanted[1:]
-            self.mission = self.words.format(*self.wanted) if self.wanted and self.errands == 3 else self.mission
-        return self.seen(), float(not self.wanted), not self.wanted, self.steps >= 40, {}
+        self.done += int(self.at == self.cells[(self.first + self.done) % 2])
+        over = self.done == self.errands
+        return self.seen(), float(over), over, self.steps >= 40, {}
 
     def seen(self):
         grid = np.zeros((1, 7, 1), np.uint8)
-        grid[0, [self.cells["red"], self.cells["blue"]], 0] = (3, 5)
+        grid[0, self.cells, 0] = (3, 5)
         grid[0, self.at, 0] += 1
-        return {"grid": grid, "mission": self.mission}
+        at = self.first + (min(self.done, 2) if self.errands == 3 else 0)
+        return {"grid": grid, "mission": self.words.format(COLOURS[at % 2], COLOURS[(at + 1) % 2])}
 
 
 class Both(Errands):
@@ -113,6 +111,8 @@ def test_skills_are_learned_from_long_recordings_and_planned_with(library, capsy
     assert main(["plan", BOTH, "--skills", folder, "--episodes", "12", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["rewarded"]["value"] > 0.8 and len(result["episodes"][0]["events"]) >= 3
+    assert main(["plan", BOTH, "--skills", folder, "--episodes", "2", "--rollouts", "2"]) == 0
+    assert ", 100% of its rollouts end" in capsys.readouterr().out
     goal = "go to the blue ball, then go to the red ball, then go to the blue ball"
     assert main(["plan", NAME, "--skills", folder, "--goal", goal, "--episodes", "3"]) == 0
     assert "go to the blue ball, then go to the red ball" in capsys.readouterr().out
@@ -153,6 +153,7 @@ def test_a_skill_is_renamed_tried_and_listed(library, capsys):
     [
         (["--goal", "go to the crimson ball"], "do not know 'crimson'"),
         (["--goal", "go"], "no skill does 'go'"),
+        (["--rollouts", "-1"], "--rollouts is 0 or more"),
         (["--goal", "go to the red ball", "--proposal", "x"], "--proposal: plans of skills have no use"),
     ],
 )

@@ -66,6 +66,8 @@ class PlanConfig:
     skills: Path | None = None
     """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills. Without --goal
     each episode has the environment's own instruction."""
+    rollouts: int = 0
+    """With --skills: rollouts in the world of each of the four likeliest plans, to choose among them. Default: 0, none."""
     real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
     environment: EnvironmentConfig = EnvironmentConfig()
     episodes: int = 10  # Number of episodes.

@@ -12,7 +12,9 @@ from tyro.conf import arg
 
 from ..act.actor import policy_folder
 from ..act.imitation import load_imitation_network
-from ..act.skills.actor import SkillActor, SkillMemory
+from ..act.planning import FullyObserved
+from ..act.skills.actor import SkillActor
+from ..act.skills.imagined import PlanRollouts
 from ..act.skills.library import SkillLibrary
 from ..act.skills.search import SkillSearch
 from ..core.errors import TerrellaError
@@ -21,12 +23,13 @@ from ..core.policy import act
 from ..core.world import World, make_rng
 from ..learn.recipes.imitation import open_demonstrations
 from ..learn.recipes.skills import SkillTraining, learn_skills
+from ..library import is_truth
 from ..measure.statistics import Figure, wilson
 from .goals import REWARD
-from .opening import EnvironmentConfig
+from .opening import EnvironmentConfig, device_of, load_named
 from .plan_study import PlanConfig
 from .progress import Progress, silent, stage
-from .real_environment import STEPS
+from .real_environment import STEPS, check_alike, open_copied, open_real
 from .results import changed_settings, jsonable, table_lines
 
 MOST_STARTS = 50  # starts of an environment that are drawn for each try, until its instruction is one of the skill
@@ -186,13 +189,19 @@ def try_skill(folder: str | Path, name: str, config: TrySkillConfig, *, progress
 def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = silent) -> SkillPlanResult:
     """Plans with the skills of a library and acts in an environment. PlanningError for a goal that it does not understand, or that
     no order of its skills is likely to reach from the first start."""
-    used = {"goal", "skills", "real", "episodes", "steps", "seed"}
+    used = {"goal", "skills", "rollouts", "real", "episodes", "steps", "seed", *vars(config.environment), "device"}
     if useless := [key for key in changed_settings(config) if key.replace("-", "_") not in used]:
         raise TerrellaError(f"--{useless[0].replace('_', '-')}: plans of skills have no use for that.")
     assert config.skills is not None
-    library, world = SkillLibrary.load(config.skills), EnvironmentConfig().open(config.real or name)
-    goal = None if config.goal == REWARD else config.goal
-    actor, steps = SkillActor(library, world.spec, goal), config.steps or world.spec.max_episode_steps or STEPS
+    library, goal = SkillLibrary.load(config.skills), None if config.goal == REWARD else config.goal
+    inside, world = _worlds(name, config, progress)
+    rollouts = None
+    if inside is not None:
+        rollouts = PlanRollouts(inside, SkillActor(library, inside.spec, goal), config.rollouts, config.seed)
+    actor, steps = (
+        SkillActor(library, world.spec, goal, rollouts),
+        config.steps or world.spec.max_episode_steps or STEPS,
+    )
     if goal is not None:
         search = SkillSearch(library)
         first = world.render(world.start(1, make_rng(config.seed)), actor.sees)
@@ -212,6 +221,21 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     return SkillPlanResult(goal, tuple(episodes))
 
 
+def _worlds(name: str, config: PlanConfig, progress: Progress) -> tuple[World | None, World]:
+    """The world in which plans are rolled out, if they are, and the environment to act in."""
+    if config.rollouts < 0:
+        raise TerrellaError("--rollouts is 0 or more.")
+    if not config.rollouts:
+        return None, config.environment.open(config.real or name)
+    if is_truth(name):
+        inside: World = FullyObserved(open_copied(name, config.environment))
+    else:
+        inside = load_named(name, device_of(config.device), progress=progress)
+    real = inside if config.real in (None, name) else open_real(str(config.real), config.environment, inside.spec)
+    check_alike(inside.spec, real.spec)
+    return inside, real
+
+
 @torch.no_grad()
 def _episode(world: World, state: Any, actor: SkillActor, steps: int, rng: torch.Generator) -> SkillEpisode:
     """One episode; it ends when the plan is done, the environment ends it, or after `steps` steps."""
@@ -220,16 +244,12 @@ def _episode(world: World, state: Any, actor: SkillActor, steps: int, rng: torch
     seen = world.render(state, channels)
     for step in range(steps):
         action, memory = act(actor, seen, memory, 1, world.spec, rng)
-        if _finished(memory[0]):
+        if memory[0].finished:
             return SkillEpisode(memory[0].events, True, reward, step)
         state = world.imagine(state, action, rng)
         seen = world.render(state, channels)
         reward += float(seen["reward"]) if "reward" in seen else 0.0
         if "done" in seen and bool(seen["done"]):
             _, memory = act(actor, seen, memory, 1, world.spec, rng)
-            return SkillEpisode(memory[0].events, _finished(memory[0]), reward, step + 1)
+            return SkillEpisode(memory[0].events, memory[0].finished, reward, step + 1)
     return SkillEpisode(memory[0].events, False, reward, steps)
-
-
-def _finished(memory: SkillMemory) -> bool:
-    return memory.plan is not None and memory.at == len(memory.plan.steps)

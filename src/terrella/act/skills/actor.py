@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import final
 
 import torch
@@ -15,49 +15,35 @@ from ...core.state import State
 from ...core.world import Observation
 from ..imitation import ImitationActor
 from ..imitation_network import TEXT
+from .imagined import ALTERNATIVES, PlanRollouts
 from .library import SkillLibrary
-from .search import Groups, SkillPlan, SkillSearch, undone
+from .memory import SkillMemory
+from .search import SkillSearch, undone
 
 PATIENCE = 2.0  # times the usual longest duration, after which an instruction that is not done is planned anew
 MOST_PLANS = 8  # of an episode; the last one is kept to
 SURPRISE = 2.0  # spreads by which a forecast may differ from what came
 
 
-@dataclass(frozen=True)
-class SkillMemory:
-    """What one episode is about."""
-
-    goal: str
-    groups: Groups  # what `plan` plans
-    plan: SkillPlan | None  # None before the first observation
-    at: int  # the step of the plan that is carried out
-    steps: int  # actions since it began
-    fast: State  # the memory of the policy
-    plans: int = 0
-    events: tuple[str, ...] = ()  # what was planned, done and planned anew, for people
-
-    @property
-    def text(self) -> str:
-        """The instruction that is carried out; the last one once all are done."""
-        if self.plan is None:
-            return self.goal
-        return self.plan.steps[min(self.at, len(self.plan.steps) - 1)].text
-
-
 @final
 class SkillActor:
     """A Policy that reaches goals in words by the skills of a library, however unlikely its best plan is. goal: for all episodes;
-    None: the text that it is shown. ActionError or ChannelError if the library is for others, PlanningError for unknown words."""
+    None: the text that it is shown. rollouts: choose among plans in a world. ActionError or ChannelError if the library is for
+    others, PlanningError for unknown words."""
 
-    def __init__(self, library: SkillLibrary, spec: Spec, goal: str | None = None):
+    def __init__(
+        self, library: SkillLibrary, spec: Spec, goal: str | None = None, rollouts: PlanRollouts | None = None
+    ):
         shown = spec if goal is None else replace(spec, channels={**spec.channels, TEXT: TEXT_SPACE})
         self.policy, self.library, self.goal = ImitationActor(library.network, shown), library, goal
-        self.search, self.spec = SkillSearch(library, least=0.0), spec
+        self.search, self.spec, self.rollouts = SkillSearch(library, least=0.0), spec, rollouts
         self._blank: State | None = None
 
     @property
     def sees(self) -> tuple[str, ...]:
-        return tuple(name for name in self.policy.sees if self.goal is None or name != TEXT)
+        further = self.rollouts.world.spec.observes if self.rollouts else ()
+        names = dict.fromkeys((*self.policy.sees, *further))
+        return tuple(name for name in names if self.goal is None or name != TEXT)
 
     def unknown(self, text: str) -> tuple[str, ...]:
         """The words of a goal that it does not know."""
@@ -99,7 +85,7 @@ class SkillActor:
                 return one
             due = one.plan.steps[one.at] if one.plan else step
             now = self.search.now(due.text, seen)
-            if left > 2 and now.probability < due.probability - SURPRISE * due.spread - 0.05:
+            if left > 2 and one.plans < MOST_PLANS and now.probability < due.probability - SURPRISE * due.spread - 0.05:
                 why = f"'{due.text}' has {now.probability:.0%} here, {due.probability:.0%} was expected"
                 return self._begun(one, seen, why)
         elif one.steps > PATIENCE * step.skill.most_steps and one.plans < MOST_PLANS:
@@ -114,8 +100,14 @@ class SkillActor:
         """A new plan for what is left to do."""
         assert self._blank is not None
         groups = one.groups if one.plan is None else undone(one.plan, one.at, one.groups)
-        plan = self.search.plan(groups, seen)
-        events = (*one.events, f"{why}: {plan}, {plan.probability:.0%} in all")
+        plans = self.search.plans(groups, seen, ALTERNATIVES if self.rollouts else 1)
+        plan = plans[0]
+        if self.rollouts:
+            fresh = replace(one, groups=groups, at=0, steps=0, fast=self._blank, plans=MOST_PLANS)
+            plan = self.rollouts.best(plans, fresh, seen)
+        shown = f"{plan}, {plan.probability:.0%} in all"
+        shown += "" if plan.imagined is None else f", {plan.imagined:.0%} of its rollouts end"
+        events = (*one.events, f"{why}: {shown}")
         return replace(
             one, groups=groups, plan=plan, at=0, steps=0, fast=self._blank, plans=one.plans + 1, events=events
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -36,6 +37,7 @@ class SkillPlan:
     """Instructions in their order."""
 
     steps: tuple[SkillForecast, ...]
+    imagined: float | None = None  # the share of its rollouts in a world that carry it out
 
     @property
     def probability(self) -> float:
@@ -86,34 +88,37 @@ class SkillSearch:
     def plan(self, groups: Groups, seen: Observation) -> SkillPlan:
         """The likeliest order and arguments of all phrases, from an observation [1, ...]. PlanningError where even that is less
         likely than `least`."""
+        return self.plans(groups, seen, 1)[0]
+
+    def plans(self, groups: Groups, seen: Observation, count: int) -> list[SkillPlan]:
+        """The `count` likeliest plans, or fewer where there are no more. PlanningError as of `plan`."""
+        plans = self._cheapest(groups, seen, count)
+        if plans[0].probability < self.least:
+            raise PlanningError(_why_hopeless(plans[0]))
+        return plans
+
+    def _cheapest(self, groups: Groups, seen: Observation, count: int) -> list[SkillPlan]:
         now = self._now(seen, tuple(itertools.chain(*itertools.chain(*groups))))
         tie, queue = itertools.count(), [(0.0, 0, 0, frozenset[int](), tuple[SkillForecast, ...]())]
-        reached: set[tuple[int, frozenset[int], str]] = set()
-        while True:
+        reached: Counter[tuple[int, frozenset[int], str]] = Counter()
+        plans: list[SkillPlan] = []
+        while queue and len(plans) < count:
             cost, _, at, done, steps = heapq.heappop(queue)
             if at < len(groups) and len(done) == len(groups[at]):
                 at, done = at + 1, frozenset()
             if at == len(groups):
-                break
-            last = steps[-1].text if steps else ""
-            if (at, done, last) in reached:
+                plans.append(SkillPlan(steps))
                 continue
-            reached.add((at, done, last))
+            last = steps[-1].text if steps else ""
+            reached[at, done, last] += 1
+            if reached[at, done, last] > count:
+                continue
             for number, texts in enumerate(groups[at]):
                 for text in texts if number not in done else ():
                     step = self.after(last, text) if last else now[text]
                     paid = STEP_COST * step.steps - math.log(max(step.probability, 1e-9))
                     heapq.heappush(queue, (cost + paid, next(tie), at, done | {number}, (*steps, step)))
-        plan = SkillPlan(steps)
-        if plan.probability < self.least:
-            weak = min(steps, key=lambda step: step.probability)
-            place = steps.index(weak)
-            where = f"where '{steps[place - 1].text}' ends" if place else "from here"
-            raise PlanningError(
-                f"no order of these skills is likely to work: the best, {plan}, has {plan.probability:.1%}, for '{weak.text}' "
-                f"seldom begins {where} in the recordings."
-            )
-        return plan
+        return plans
 
     def after(self, before: str, text: str) -> SkillForecast:
         """The forecast of an instruction at the ends of another."""
@@ -155,6 +160,16 @@ class SkillSearch:
             spread = float(p.std()) if len(p) > 1 else 0.0
             forecasts.append(SkillForecast(text, skill, float(p.mean()), spread, float(steps[number].mean())))
         return forecasts
+
+
+def _why_hopeless(plan: SkillPlan) -> str:
+    weak = min(plan.steps, key=lambda step: step.probability)
+    place = plan.steps.index(weak)
+    where = f"where '{plan.steps[place - 1].text}' ends" if place else "from here"
+    return (
+        f"no order of these skills is likely to work: the best, {plan}, has {plan.probability:.1%}, for '{weak.text}' "
+        f"seldom begins {where} in the recordings."
+    )
 
 
 def undone(plan: SkillPlan, at: int, groups: Groups) -> Groups:
