@@ -16,6 +16,7 @@ from ..workflows.build_space import (
 )
 from ..workflows.edit_space import EditSpaceConfig, edit_space
 from ..workflows.export_space import ExportSpaceConfig, export_space
+from ..workflows.grow_space import GrowSpaceConfig, grow_space
 from ..workflows.lift_space import LiftSpaceConfig, lift_space
 from ..workflows.results import command
 from ..workflows.splat_places import editable_place
@@ -64,6 +65,16 @@ def lift(
         out: Folder of the world.
     """
     show(lift_space(picture, out, config), json, _viewing(out))
+
+
+def grow(world: PlaceName, config: GrowSpaceConfig, json: Json = False) -> None:
+    """Invent what a place does not know: walls, floor and ceiling of a room go on where nothing was seen. Each step is one edit,
+    which `space edit --undo` takes back; the same command goes on.
+
+    Args:
+        world: A world of Gaussians: its folder, or the run that made it.
+    """
+    show(grow_space(world, config, progress=say), json, _viewing(world))
 
 
 def import_(

@@ -16,7 +16,7 @@ from ..fitting import PosedViews
 from ..raster.move import multiply_quaternions, quaternion_of
 from .reading import blurred, read_picture, sharpness
 
-FEWEST = 16  # pictures of a fit
+FEWEST = 8  # pictures of a fit
 MIDDLE_M = 3.0  # how far away the middle point lies where nothing says how long a unit is
 
 
