@@ -20,6 +20,7 @@ CEILING_M, BEHIND_M = (
 )  # without evidence; how far behind one an unseen wall stands, at least and at most
 OUTER = 0.35  # share of the strongest peak from which the outermost one is a wall
 WALLS, BLOCK = (0, 1, 3, 4), 20  # planes; cells of a block of colours that is repeated
+OUTERMOST = 0.85  # quantile of a surface's distance that is taken for its plane: rather too far than within free space
 FACING = 0.9  # cosine between a surface's normal and a plane's
 
 
@@ -89,7 +90,7 @@ def _heading(normals: torch.Tensor, area: torch.Tensor) -> float:
     upright = normals[:, 2].abs() < 0.35
     angle = torch.atan2(normals[upright, 1], normals[upright, 0]) % (math.pi / 2)
     counts = torch.zeros(90).index_add_(0, (angle * (180 / math.pi)).long().clamp_max(89), area[upright])
-    smooth = sum(counts.roll(k) * (3 - abs(k)) for k in range(-2, 3))
+    smooth = torch.stack([counts.roll(k) * (3 - abs(k)) for k in range(-2, 3)]).sum(0)
     best = (int(smooth.argmax()) + 0.5) * math.pi / 180
     off = (angle - best + math.pi / 4) % (math.pi / 2) - math.pi / 4
     near = off.abs() < 0.05
@@ -108,7 +109,7 @@ def _bound(points, normals, area, at: torch.Tensor, plane: int) -> float | None:
     smooth = counts + counts.roll(1) + counts.roll(-1)
     outer = int((smooth > OUTER * smooth.max()).nonzero()[-1])
     near = some & ((away / 0.1 - outer).abs() < 2)
-    return float(at[axis] + side * away[near].median())
+    return float(at[axis] + side * away[near].quantile(OUTERMOST))
 
 
 def _unseen(bounds: list[float | None], reach: torch.Tensor, at: torch.Tensor, plane: int) -> float:
@@ -126,7 +127,7 @@ def _unseen(bounds: list[float | None], reach: torch.Tensor, at: torch.Tensor, p
 
 def _pictures(points, normals, colours, low: torch.Tensor, high: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """The colours of the six planes: those of near surfaces; beside them their mirror image; far from them the usual colour."""
-    parts, usual = [], []
+    pictures, known, usual = [], [], []
     for plane in range(6):
         axis, end = plane % 3, (high if plane > 2 else low)[plane % 3]
         near = ((points[:, axis] - end).abs() < NEAR_M) & (normals[:, axis].abs() > FACING)
@@ -137,16 +138,18 @@ def _pictures(points, normals, colours, low: torch.Tensor, high: torch.Tensor) -
         flat, shown = (at[0] * size[1] + at[1])[inside], colours[near][inside]
         count = torch.zeros(size[0] * size[1]).index_add_(0, flat, torch.ones(len(flat)))
         total = torch.zeros(size[0] * size[1], 3).index_add_(0, flat, shown)
-        parts.append(((total / count.clamp_min(1)[:, None]).view(*size, 3), (count > 0).view(*size)))
+        pictures.append((total / count.clamp_min(1)[:, None]).view(*size, 3))
+        known.append((count > 0).view(*size))
         usual.append(shown)
     plain = [
         torch.cat([usual[k] for k in ((plane,) if plane % 3 == 2 and len(usual[plane]) > 50 else WALLS)])
         for plane in range(6)
     ]
     middle = [one.median(0).values if len(one) else torch.full((3,), 0.6) for one in plain]
-    best = max(WALLS, key=lambda plane: int(parts[plane][1].sum()))
-    tiles = [_tile(*parts[best if plane in WALLS else plane], middle[plane]) for plane in range(6)]
-    return tuple(_continued(*part, tile) for part, tile in zip(parts, tiles))
+    best = max(WALLS, key=lambda plane: int(known[plane].sum()))
+    sources = [best if plane in WALLS else plane for plane in range(6)]
+    tiles = [_tile(pictures[source], known[source], one) for source, one in zip(sources, middle)]
+    return tuple(_continued(*part) for part in zip(pictures, known, tiles))
 
 
 def _tile(picture: torch.Tensor, known: torch.Tensor, usual: torch.Tensor) -> torch.Tensor:
