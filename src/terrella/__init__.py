@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .act.planning import SearchConfig
     from .core import Spec, State, World, check_world, make_rng, rollout
     from .core.env import as_env
+    from .learn.recipes.adapt import AdaptConfig
     from .learn.recipes.latent import LatentTraining
     from .learn.recipes.policy import Practice
     from .learn.recipes.video import TrainConfig
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from .workflows.plan_study import PlanConfig
     from .workflows.practise import PractiseConfig, PractiseResult, practise
     from .workflows.score import ScoreConfig, ScoreResult, score
-    from .workflows.train import TrainResult, train_latent, train_video
+    from .workflows.train import TrainResult, adapt, train_latent, train_video
     from .workflows.train_policy import TrainPolicyConfig, TrainPolicyResult, train_policy
     from .workflows.transfer import TransferConfig, TransferResult, transfer
 
@@ -42,6 +43,7 @@ _NAMES = {
     ".act.planning": ("SearchConfig",),
     ".core": ("Spec", "State", "World", "check_world", "make_rng", "rollout"),
     ".core.env": ("as_env",),
+    ".learn.recipes.adapt": ("AdaptConfig",),
     ".learn.recipes.latent": ("LatentTraining",),
     ".learn.recipes.policy": ("Practice",),
     ".learn.recipes.video": ("TrainConfig",),
@@ -59,7 +61,7 @@ _NAMES = {
     ".workflows.plan_study": ("PlanConfig",),
     ".workflows.practise": ("PractiseConfig", "PractiseResult", "practise"),
     ".workflows.score": ("ScoreConfig", "ScoreResult", "score"),
-    ".workflows.train": ("TrainResult", "train_latent", "train_video"),
+    ".workflows.train": ("TrainResult", "adapt", "train_latent", "train_video"),
     ".workflows.train_policy": ("TrainPolicyConfig", "TrainPolicyResult", "train_policy"),
     ".workflows.transfer": ("TransferConfig", "TransferResult", "transfer"),
 }

@@ -46,6 +46,7 @@ OPTIONS = {
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "bench costs": "--batch --device --fast --json --minutes --seed",
     "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",
+    "adapt": "--batch --device --from --json --keep --learning-rate --minutes --no-laws --out --seed --steps",
     "check": "--coarse --data --device --fresh --json --metres-per-pixel --out --pictures --rollouts --seed --steps --system",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

@@ -6,6 +6,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from ..learn.devices import describe_device, device_named
+from ..learn.recipes.adapt import AdaptConfig
 from ..learn.recipes.goals import GoalTraining, train_goals
 from ..learn.recipes.latent import LatentTraining
 from ..learn.recipes.latent_actions import LatentActionsConfig, train_latent_actions
@@ -23,6 +24,7 @@ from ..library import folder_of
 from ..workflows.opening import Device, load_named
 from ..workflows.progress import Report
 from ..workflows.results import command
+from ..workflows.train import adapt as adapt_world
 from ..workflows.train import run_recipe, train_latent, train_video
 from ..worlds.folder import load_world
 from ..worlds.learned import LearnedWorld
@@ -69,6 +71,27 @@ def goals(
     """
     inside = load_named(world, device)
     _shown(lambda report: train_goals(inside, world, recording, out, config, report), json, run=out)
+
+
+def adapt(
+    name: WorldName,
+    data: Annotated[str, arg(name="from")],
+    out: str,
+    config: AdaptConfig,
+    keep: Annotated[str | None, arg(metavar="RECORDING")] = None,
+    json: Json = False,
+) -> None:
+    """Adapt a latent world to another body or camera: it goes on learning on a recording of minutes. Stop it with Ctrl-C at any
+    time; the same command continues.
+
+    Args:
+        name: The latent world: a run of `train latent`, or its folder.
+        data: A recording of the other body or camera, with the same channels and as many actions.
+        out: Folder of the run; the adapted world is in OUT/world.
+        keep: A recording that the world was trained on. Half of each batch is of it, so that less is forgotten, and how much is
+            forgotten is measured.
+    """
+    show(adapt_world(name, data, out, config, keep=keep, progress=say), json, _playing(out))
 
 
 def estimator(data: RecordingName, out: str, config: EstimatorTraining, json: Json = False) -> None:

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import nn
 
 from ..core.errors import DatasetError
 from ..data import Dataset, check_game
-from ..worlds.generator import UNet
 from ..worlds.learned import LearnedWorld
 from .batches import Dream
 from .feeds import place_feed
@@ -53,7 +53,7 @@ def open_paired(world: LearnedWorld, data: str | Path, keep_out: Box | None, rep
     return Paired(world, replace(recording, controls=controls).require_rows())
 
 
-def fingerprint(generator: UNet) -> str:
+def fingerprint(generator: nn.Module) -> str:
     """A hash of the weights, by which a resumed run checks that it has the world that it began with."""
     digest = hashlib.sha256()
     for weight in generator.state_dict().values():

@@ -186,8 +186,8 @@ def trajectory_of(system: PhysicalSystem, observations: Mapping[str, Tensor], dt
         raise ChannelError(
             f"the laws need the channels {', '.join(missing)}, which are not there; there are {', '.join(observations)}."
         )
-    flat = {name: observations[name].detach().cpu().double().flatten(2) if observations[name].ndim > 2
-            else observations[name].detach().cpu().double()[..., None] for name in system.channels}  # fmt: skip
+    whole = {name: observations[name].cpu().double() for name in system.channels}
+    flat = {name: part.flatten(2) if part.ndim > 2 else part[..., None] for name, part in whole.items()}
     each = [_body(system, body, flat, dt_s) for body in system.bodies]
     position, velocity, rotation, spin, present, radius = (torch.stack(part, 2) for part in zip(*each))
     return Trajectory(system, dt_s, position, velocity, rotation, spin, present, radius, flat)

@@ -1,4 +1,4 @@
-"""`train_video` and `train_latent`: a recording becomes a world."""
+"""`train_video` and `train_latent`: a recording becomes a world; `adapt`: a world goes on learning on another."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -7,7 +7,9 @@ from typing import Any
 
 from ..learn.devices import describe_device
 from ..learn.recipes import latent, video
-from .opening import device_of
+from ..learn.recipes.adapt import AdaptConfig
+from ..learn.recipes.adapt import adapt as adapted
+from .opening import device_of, load_named
 from .progress import Progress, Report, silent, stage
 from .results import jsonable
 
@@ -45,6 +47,21 @@ def train_latent(
     settings = config or latent.LatentTraining()
     progress(f"It trains on {describe_device(device_of(settings.device))}.")
     return run_recipe(lambda report: latent.train_latent(data, out, settings, report), progress, run=out)
+
+
+def adapt(
+    world: str,
+    data: str | Path,
+    out: str | Path,
+    config: AdaptConfig | None = None,
+    *,
+    keep: str | Path | None = None,
+    progress: Progress = silent,
+) -> TrainResult:
+    """Adapts the latent world named `world` to the body or camera of the recording `data`. keep: a recording that it was trained
+    on, of which half of each batch is made. The facts have the open-loop errors before and after; the run is in `out`."""
+    settings, opened = config or AdaptConfig(), load_named(world)
+    return run_recipe(lambda report: adapted(opened, data, out, settings, report, keep), progress, run=out)
 
 
 def run_recipe(recipe: Callable[[Report], Mapping[str, Any]], progress: Progress, **facts: Any) -> TrainResult:

@@ -5,7 +5,7 @@ projections of the latents that are not standard normal (LeJEPA, Balestriero & L
 of pictures are decoded, too, so that they hold what one sees.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +30,7 @@ NO_PAST, NO_VECTORS = (
 BAGGING = 0.75  # the part of the clips from which an ensemble member learns
 LEAST_UNIT = 1e-3  # standard deviations: the smallest change in a step by which errors are scaled
 DECODED = 24  # latents a step that the decoder learns from
-NUMBERS_WEIGHT, OUTCOME_WEIGHT, INVERSE_WEIGHT = 1.0, 0.3, 1.0
+NUMBERS_WEIGHT, OUTCOME_WEIGHT, INVERSE_WEIGHT, LAWS_WEIGHT = 1.0, 0.3, 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,18 @@ def sigreg(latents: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
 
 
 class LatentPrediction:
-    """Predicts `steps` steps beyond the history, each from the predictions before it."""
+    """Predicts `steps` steps beyond the history, each from the predictions before it. laws: the loss of rollouts of the vectors
+    [B, T + 1, V] that break a law."""
 
-    def __init__(self, network: LatentNetwork, controls: Controls, learning_rate: float, steps: int):
-        self.network, self.controls, self.steps = network, controls, steps
+    def __init__(
+        self,
+        network: LatentNetwork,
+        controls: Controls,
+        learning_rate: float,
+        steps: int,
+        laws: Callable[[torch.Tensor], torch.Tensor] | None = None,
+    ):
+        self.network, self.controls, self.steps, self.laws = network, controls, steps, laws
         self.modules = {"network": network}
         parts = (network.encoder, network.predictor, network.heads, network.leaper, network.decoder)
         trained = [part for part in parts if parameters(part)]
@@ -114,7 +122,10 @@ class LatentPrediction:
             parts["picture"] = self._picture_loss(decoded, batch.rgb, now)
         real = latents.unfold(1, config.history, 1).movedim(-1, 2)  # [B, T + 1, K, D]
         parts |= self._head_losses(real, torch.stack(windows, 1), torch.stack(predicted, 1), latents, batch)
-        weights = {"sigreg": SIGREG, "numbers": NUMBERS_WEIGHT, "inverse": INVERSE_WEIGHT}
+        if self.laws is not None:
+            numbers = self.network.numbers(torch.stack(windows, 1).flatten(0, 1)).unflatten(0, (len(latents), -1))
+            parts["laws"] = self.laws(numbers * self.network.scale + self.network.mean)
+        weights = {"laws": LAWS_WEIGHT, "sigreg": SIGREG, "numbers": NUMBERS_WEIGHT, "inverse": INVERSE_WEIGHT}
         weights |= {"reward": OUTCOME_WEIGHT, "done": OUTCOME_WEIGHT}
         terms = (weights.get(name, 1.0) * part for name, part in parts.items())
         yield Loss("latent", sum(terms, error.new_zeros(())), parts)

@@ -22,9 +22,12 @@ from ..devices import device_named
 from ..feeds import ClipStream
 from ..latent_validation import ARMS, calibrate, encode_rows, rollout_frames, validate
 from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, set_scale
+from ..objectives.lawful import LawLoss
 from ..objectives.outcome import levels
+from ..paired import fingerprint
 from ..recording import Recording
-from ..sized_feed import SizedFeed
+from ..rehearsal import Rehearsal
+from ..sized_feed import Feed, SizedFeed
 from ..strips import write_lines
 from ..trainer import Paced, Report, Run, Trainer
 
@@ -80,22 +83,41 @@ class LatentTraining:
     device: str = "auto"  # cpu, cuda or auto.
 
 
+@dataclass(frozen=True)
+class Beginning:
+    """What a training continues: a finished world, and a recording of what it learned before, if there is one."""
+
+    world: LatentWorld
+    kept: Recording | None = None
+    laws: bool = False  # whether the laws of physics are a part of the loss, where the recording describes its bodies
+
+
 def train_latent(
-    data: str | Path, out: str | Path, config: LatentTraining, report: Report, paced: Paced | None = None
+    data: str | Path,
+    out: str | Path,
+    config: LatentTraining,
+    report: Report,
+    paced: Paced | None = None,
+    begin: Beginning | None = None,
 ) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
-    `Trainer.train`."""
+    `Trainer.train`; `begin`: see `adapt`."""
     _check(config)
     dataset = Dataset(data)
-    size = config.size or fitted_size(dataset)
-    run = Run.of(
-        out, config, report, device_named(config.device), ("hours",),
-        **{"frames": dataset.length, "recording of": dataset.world.get("name")},
-    )  # fmt: skip
+    facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
+    if begin is not None:
+        facts |= {"begins with": fingerprint(begin.world.network), "keeps": len(begin.kept.start) if begin.kept else 0}
+        facts["laws"] = begin.laws
+    run = Run.of(out, config, report, device_named(config.device), ("hours",), **facts)
     run.saved_facts(STAGE)
-    recording = Recording.open(dataset, size, report, needs=("action",), why=WHY).require_rows()
+    recording = open_rows(dataset, config.size or fitted_size(dataset), report)
     torch.manual_seed(config.seed)
-    return _Training(run, recording, config).learn(paced)
+    return _Training(run, recording, config, begin).learn(paced)
+
+
+def open_rows(data: str | Path | Dataset, size: tuple[int, int] | None, report: Report) -> Recording:
+    """A recording with actions, and rows enough to train on."""
+    return Recording.open(data, size, report, needs=("action",), why=WHY).require_rows()
 
 
 def _check(config: LatentTraining) -> None:
@@ -148,15 +170,23 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
 class _Training:
     """The network of a latent world and its training."""
 
-    def __init__(self, run: Run, recording: Recording, config: LatentTraining):
-        self.run, self.recording, self.config = run, recording, config
+    def __init__(self, run: Run, recording: Recording, config: LatentTraining, begin: Beginning | None = None):
+        self.run, self.recording, self.config, self.begin = run, recording, config, begin
         assert recording.controls is not None  # see WHY
         self.controls = recording.controls
         self.sees_pictures = recording.cache.rgb is not None and config.pictures
-        shape = self._shape()
+        shape = self._shape() if begin is None else begin.world.network.config
         seen = [name for name, _ in shape.vectors] + ["rgb"] * self.sees_pictures
         self.recording = recording = recording.having(seen)
         self.network = LatentNetwork(shape).to(run.device)
+        if begin is not None:
+            self.network.load_state_dict(begin.world.network.state_dict())
+            if shape.leap > (steps := self._rollout()):
+                raise DatasetError(
+                    f"{begin.world.spec.name} predicts {shape.leap} steps at once, and the episodes of {recording.name} are long "
+                    f"enough for {steps}; record longer ones."
+                )
+            return
         arrays = [self._array(name) for name, _ in shape.vectors]
         rows = np.flatnonzero(recording.usable)
         flat = [np.asarray(array[rows], np.float32).reshape(len(rows), -1) for array in arrays]
@@ -226,17 +256,31 @@ class _Training:
     def learn(self, paced: Paced | None) -> dict:
         config, recording = self.config, self.recording
         steps = self._rollout()
-        lengths = [np.subtract(*recording.cache.episodes[number][::-1]) for number in recording.seen]
-        clips = int(sum(max(0, length - config.history - steps + 1) for length in lengths))
-        batch = min(config.batch or (32 if self.sees_pictures else 128), clips)
-        names = [name for name in ("action", "reward", "done") if getattr(recording.cache, name) is not None]
+
+        def clips_in(source: Recording) -> int:
+            lengths = [np.subtract(*source.cache.episodes[number][::-1]) for number in source.seen]
+            return int(sum(max(0, length - config.history - steps + 1) for length in lengths))
+
+        batch = min(config.batch or (32 if self.sees_pictures else 128), clips_in(recording))
+        kept = self.begin.kept if self.begin else None
+        caches = [recording.cache, *([kept.cache] if kept else [])]
+        names = [name for name in ("action", "reward", "done") if all(getattr(one, name) is not None for one in caches)]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
-        settings = ClipsConfig(config.history + steps, names, seed=config.seed, episodes=recording.seen)
-        make = lambda rows, now: latent_clips(rows, self.controls, self.network.config, now.device)  # noqa: E731
-        objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps)
+        laws = LawLoss.of(recording, self.network, steps) if self.begin and self.begin.laws else None
+        objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps, laws)
         total = config.steps or (2500 if self.sees_pictures else 4000)
-        clips = lambda size: ClipStream(Clips(recording.cache, replace(settings, batch=size)), make)  # noqa: E731
-        trainer = Trainer(self.run, STAGE, SizedFeed(clips, batch, min(2, batch)), objective, total)
+
+        def stream(source: Recording, size: int) -> Feed:
+            least, controls = min(size, clips_in(source)), source.controls
+            assert controls is not None  # see WHY
+            settings = ClipsConfig(config.history + steps, names, least, seed=config.seed, episodes=source.seen)
+            make = lambda rows, now: latent_clips(rows, controls, self.network.config, now.device)  # noqa: E731
+            return ClipStream(Clips(source.cache, settings), make)
+
+        def feed(size: int) -> Feed:
+            return Rehearsal(stream(recording, size // 2), stream(kept, size // 2)) if kept else stream(recording, size)
+
+        trainer = Trainer(self.run, STAGE, SizedFeed(feed, batch, min(4 if kept else 2, batch)), objective, total)
         done = (self.run.out / "world" / WORLD_FILE).exists() and "validation" in trainer.facts
         if not trainer.finished:
             trainer.facts.pop("validation", None)
@@ -280,8 +324,10 @@ class _Training:
         recording, shape = self.recording, self.network.config
         game = recording.cache.world.get("name")
         sees = [*(["rgb"] if shape.pictured else []), *shape.seen]
+        began = {"adapted from": self.begin.world.spec.name} if self.begin else {}
         return {
             "what": f"A latent world learned from {recording.cache.length:,} frames of {game or recording.name}",
+            **began,
             "game": game,
             "sees": ", ".join(sees),
             "data": f"{recording.usable.sum():,} frames, {len(recording.seen)} episodes",

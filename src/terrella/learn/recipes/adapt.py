@@ -1,0 +1,101 @@
+"""adapt: a latent world goes on learning, on a recording of another body or camera, beside what it learned before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...core.errors import DatasetError, TrainingError
+from ...core.world import World
+from ...worlds.folder import load_latent
+from ...worlds.latent import LatentWorld
+from ..latent_validation import ARMS, HORIZONS, open_loop
+from ..recording import Recording
+from ..trainer import Report
+from .latent import Beginning, LatentTraining, open_rows, train_latent, vectors_of
+
+
+@dataclass(frozen=True)
+class AdaptConfig:
+    """Settings of `adapt`."""
+
+    minutes: float = 10.0  # Minutes of training, earlier runs included.
+    # Training steps. Training ends after these or after --minutes, whichever comes first. Default: 4000, and with pictures 2500.
+    steps: int | None = None
+    learning_rate: float = 5e-4  # Peak learning rate.
+    # Clips per step; with --keep half of them are of that recording. Default: 128, and with pictures 32.
+    batch: int | None = None
+    # --no-laws: leave the laws of physics out of the loss. They are a part of it where the recording describes its bodies.
+    laws: bool = True
+    seed: int = 0  # Random seed.
+    device: str = "auto"  # cpu, cuda or auto.
+
+
+def adapt(
+    world: World, data: str | Path, out: str | Path, config: AdaptConfig, report: Report, keep: str | Path | None = None
+) -> dict:
+    """Trains, or resumes, a copy of a latent world on the recording `data`; `out`/world is the result. keep: a recording of what it
+    learned before, of which half of each batch is made. Returns facts, the verdict first; `errors` has, of each recording, the
+    world's open-loop error on held-out episodes by step, before and after, as a share of copy-last's. TrainingError for a world
+    that cannot go on learning; DatasetError for a recording with other channels or actions."""
+    if not isinstance(world, LatentWorld):
+        raise TrainingError(
+            f"{world.spec.name} is no latent world (`terrella train latent`), and only these adapt; of worlds with depth and poses "
+            "`terrella train dreams` continues the training."
+        )
+    if config.minutes <= 0 or (config.steps is not None and config.steps < 1):
+        raise TrainingError("--minutes is more than 0, and --steps 1 or more.")
+    shape = world.network.config
+    new, old = (_fitting(world, one, report) if one is not None else None for one in (data, keep))
+    assert new is not None
+    before = {name: errors_on(world, one) for name, one in (("new", new), ("old", old)) if one is not None}
+    settings = LatentTraining(
+        world.spec.name, shape.sees_pictures, shape.sees_vectors, tuple(name for name, _ in shape.vectors), shape.size,
+        history=shape.history, frames=shape.frames, hidden=shape.hidden, members=shape.members, leap=shape.leap,
+        steps=config.steps, hours=config.minutes / 60, batch=config.batch, learning_rate=config.learning_rate,
+        seed=config.seed, device=config.device,
+    )  # fmt: skip
+    facts = train_latent(data, out, settings, report, begin=Beginning(world, old, config.laws))
+    adapted = load_latent(facts["world"])
+    after = {name: errors_on(adapted, one) for name, one in (("new", new), ("old", old)) if one is not None}
+    errors = {name: {"before": before[name], "after": after[name]} for name in before}
+    return {**facts, "verdict": verdict(errors), "errors": errors}
+
+
+def _fitting(world: LatentWorld, data: str | Path, report: Report) -> Recording:
+    """The recording, with the channels and the actions of the world."""
+    shape, controls = world.network.config, world.controls
+    recording = open_rows(data, shape.size, report)
+    if shape.size is not None and recording.cache.rgb is None:
+        raise DatasetError(f"{data} has no pictures, which {world.spec.name} predicts; record them as well.")
+    have = dict(vectors_of(recording))
+    if other := [f"{name} of {width}" for name, width in shape.vectors if have.get(name) != width]:
+        holds = ", ".join(f"{name} of {width}" for name, width in have.items()) or "none"
+        raise DatasetError(f"{world.spec.name} takes the vectors {', '.join(other)}; {data} has {holds}.")
+    mine = recording.controls
+    if mine is None or (mine.kind, mine.numbers) != (controls.kind, controls.numbers):
+        raise DatasetError(
+            f"{data} has other actions than {world.spec.name}, which takes {controls.numbers} {controls.kind}; record a body with "
+            "as many."
+        )
+    return recording
+
+
+def errors_on(world: LatentWorld, recording: Recording) -> dict[str, float]:
+    """The open-loop error of the latent after some steps on held-out episodes, as a share of copy-last's."""
+    latent = open_loop(world, recording, HORIZONS).table()["latent"]
+    return {step: round(latent[ARMS[0]][step] / max(latent[ARMS[2]][step], 1e-9), 4) for step in latent[ARMS[0]]}
+
+
+def verdict(errors: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    """What was gained and what was forgotten, in two sentences."""
+    new = errors["new"]
+    last = list(new["after"])[-1]
+    now, was = new["after"][last], new["before"][last]
+    words = f"After {last} steps its error on the new recording is {now:.2f} of copy-last's, before {was:.2f}."
+    if "old" not in errors:
+        return f"{words} What it forgot was not measured: give --keep with a recording that it was trained on."
+    old = errors["old"]
+    last = list(old["after"])[-1]
+    return f"{words} On the old one it is {old['after'][last]:.2f}, before {old['before'][last]:.2f}."
