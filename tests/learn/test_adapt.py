@@ -12,6 +12,7 @@ from tests.learn.stopping import quiet
 from tests.learn.test_train_latent import LIMITS, QUICK, drifting
 
 import terrella
+from terrella.cli import main
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.data import Recorder
 from terrella.learn.objectives.latent_prediction import LatentClips
@@ -107,3 +108,15 @@ def test_batches_are_joined_row_by_row():
     one, other = (LatentClips(None, *(torch.full((2, 3, 1), value) for _ in range(4))) for value in (0.0, 1.0))
     both = joined(one, other)
     assert both.rgb is None and both.numbers[:, 0, 0].tolist() == [0, 0, 1, 1]
+
+
+def test_the_command_says_what_was_gained_and_what_was_forgotten(made, tmp_path, capsys):
+    _, old, new = made
+    run, out = str(old.parent / "run"), str(tmp_path / "out")
+    assert (
+        main(["adapt", run, "--from", str(new), "--keep", str(old), "--out", out, "--steps", "4", "--batch", "8"]) == 0
+    )
+    said = capsys.readouterr().out
+    assert said.startswith("After 16 steps its error on the new recording is") and "On the old one it is" in said
+    assert main(["adapt", "doom-maze", "--from", str(new), "--out", out]) == 2
+    assert "is no latent world" in capsys.readouterr().err
