@@ -60,9 +60,10 @@ def drift_frames(
     rollouts: int = ROLLOUTS,
     seed: int = 0,
     limit_s: float = 1e9,
+    shown: int = SHOWN,
 ) -> DriftFrames:
-    """Frames of rollouts of `world`, which has an uncertainty, along recorded episodes; determined by the seed, and by `limit_s`
-    seconds after which they end."""
+    """Frames of rollouts of `world`, which has an uncertainty, along recorded episodes, after `shown` observed frames; determined
+    by the seed, and by `limit_s` seconds after which they end."""
     network, began = world.uncertainty, time.monotonic()
     assert isinstance(network, UncertaintyNetwork)
     seen: list[torch.Tensor] = []
@@ -74,14 +75,14 @@ def drift_frames(
     dreamer = world.replaced(uncertainty=UncertaintyProbe(note))
     rng, parts, half = np.random.default_rng([seed, 14]), [], LOOKS // 2
     looks = {*np.geomspace(1, horizon, half).astype(int), *np.linspace(1, horizon, half).astype(int)}
-    begins = rng.choice(np.flatnonzero(recording.steps_ahead() >= SHOWN + horizon), rollouts)
+    begins = rng.choice(np.flatnonzero(recording.steps_ahead() >= shown + horizon), rollouts)
     chance = make_rng(int(rng.integers(2**62)))
     state = dreamer.observe(recording.evidence(dreamer.config, begins), None, chance)
-    for row in range(1, SHOWN):
+    for row in range(1, shown):
         state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, begins + row - 1), chance)
         state = dreamer.observe(recording.evidence(dreamer.config, begins + row), state, chance)
     for step in range(1, horizon + 1):
-        rows = begins + SHOWN - 1 + step
+        rows = begins + shown - 1 + step
         state = dreamer.imagine(state, recording.recorded_actions(dreamer.spec, rows - 1), chance)
         drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
         if step in looks:
