@@ -65,12 +65,20 @@ def condition(
     if batch.windows is None:
         features = network.features(seen, None if words is None else words.repeat_interleave(history, 0))
         return network(features.view(count, history, -1), acted, words, batch.outcome)
-    of_row = torch.zeros(int(batch.windows.max()) + 1, dtype=torch.int64, device=batch.windows.device)
-    of_row[batch.windows] = torch.arange(len(batch.windows), device=of_row.device)[:, None].expand_as(batch.windows)
-    features = network.features(seen, None if words is None else words[of_row])
-    recalled = network.recall(features[batch.windows], None)[0].flatten(0, 1)[:, None]
+    features = window_features(network, seen, words, batch.windows)
+    recalled = network.recall(features, None)[0].flatten(0, 1)[:, None]
     every = None if words is None else words.repeat_interleave(batch.windows.shape[1], 0)
     return network(recalled, acted, every, batch.outcome)
+
+
+def window_features(
+    network: ImitationNetwork, seen: Mapping[str, torch.Tensor], words: torch.Tensor | None, windows: torch.Tensor
+) -> torch.Tensor:
+    """The features [N, T, width] of windows [N, T] of the rows of `seen`, each of which belongs to windows of one instruction
+    [N, words]."""
+    of_row = torch.zeros(int(windows.max()) + 1, dtype=torch.int64, device=windows.device)
+    of_row[windows] = torch.arange(len(windows), device=windows.device)[:, None].expand_as(windows)
+    return network.features(seen, None if words is None else words[of_row])[windows]
 
 
 def chunk_errors(network: ImitationNetwork, logits: torch.Tensor, chunk: torch.Tensor) -> torch.Tensor:

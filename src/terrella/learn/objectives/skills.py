@@ -13,13 +13,15 @@ from ...act.skills.predictor import SkillPredictor
 from ..learners import adamw, warmup_cosine
 from ..train_step import TrainStep
 from ..trainer import Loss
+from .imitation import window_features
 
 
 @dataclass(frozen=True)
 class SkillMoments:
     """N segments of T moments, and for each a moment on the way and the end of any segment."""
 
-    seen: Mapping[str, torch.Tensor]  # channel -> [N, T, ...]
+    seen: Mapping[str, torch.Tensor]  # channel -> [M, ...], the moments of all segments
+    windows: torch.Tensor  # int64 [N, T]: the row of `seen` of each moment
     other: Mapping[str, torch.Tensor]  # channel -> [N, ...], on the way
     other_ends: Mapping[str, torch.Tensor]  # channel -> [N, ...]
     others: torch.Tensor  # bool [N]: the other segment is of another instruction
@@ -65,7 +67,6 @@ class SkillPrediction:
 def recalled_moments(network: ImitationNetwork, batch: SkillMoments) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The features of the instructions [N, words], those of all moments [N, T, width], and these with what is remembered."""
     assert network.words is not None
-    spoken, (count, length) = network.words(batch.words), batch.left.shape
-    flat = {name: value.flatten(0, 1) for name, value in batch.seen.items()}
-    features = network.features(flat, spoken.repeat_interleave(length, 0)).view(count, length, -1)
+    spoken = network.words(batch.words)
+    features = window_features(network, batch.seen, spoken, batch.windows)
     return spoken, features, network.recall(features, None)[0]

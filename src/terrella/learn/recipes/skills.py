@@ -84,12 +84,16 @@ class SkillRows:
         """These segments; of long ones the last moments."""
         s, other = self.segments, rng.choice(self.picked, len(mine))
         first = np.maximum(s.first[mine], s.end[mine] - MOST_MOMENTS + 1)
-        steps = first[:, None] + np.arange(int((s.end[mine] - first).max()) + 1)
-        left, device = s.end[mine][:, None] - steps, self.rows.device
-        seen = self.rows.observations(np.minimum(steps, s.end[mine][:, None]).ravel())
+        moments, device = np.arange(int((s.end[mine] - first).max()) + 1), self.rows.device
+        left = (s.end[mine] - first)[:, None] - moments
+        inside = left >= 0
+        before = np.cumsum(inside.sum(1)) - inside.sum(1)
+        seen = self.rows.observations((first[:, None] + moments)[inside])
+        windows = before[:, None] + np.minimum(moments, inside.sum(1)[:, None] - 1)
         at = s.first[other] + (rng.random(len(mine)) * (s.end - s.first)[other]).astype(np.int64)
         return SkillMoments(
-            {name: value.view(*left.shape, *value.shape[1:]) for name, value in seen.items()},
+            seen,
+            torch.from_numpy(windows).to(device),
             self.rows.observations(at),
             self.rows.observations(s.end[other]),
             torch.from_numpy(s.task[mine] != s.task[other]).to(device),
