@@ -164,7 +164,7 @@ def trained(row: Row, settings: Settings) -> Row:
         truth = clips.float() / 127.5 - 1
         with half_precision(device):
             seen = network.encode(truth[:, 1:], noise.new_zeros(len(clips), network.config.context))
-            made = network.clean(seen, noise, noise.new_full((len(clips),), 0.5), None)
+            made = network.clean(seen, noise, noise.new_full((len(clips),), 0.5))
         return (made - truth[:, 0]).square().mean()
 
     fast = torch.compile(loss) if settings.compile and not settings.cpu else loss

@@ -45,7 +45,7 @@ def latent(pictures: bool) -> LatentWorld:
 WORLDS = {
     "doom-maze": (lambda: terrella.load("doom-maze"), 1800),
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 2600),
-    "flow": (lambda: flow(0), 450),
+    "flow": (lambda: flow(0), 300),
     "flow that scrolls": (lambda: flow(15), 1000),
     "islet": (lambda: terrella.load("islet"), 1000),
     "latent": (lambda: latent(True), 80),

@@ -36,8 +36,8 @@ def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> t
     count = math.prod(shape)
     high, low = _halves(seeds, (count + 1) // 2, stream)
     radius, angle = high.add_(2.0**-25).log_().mul_(-2).sqrt_(), low.mul_(2 * math.pi)
-    both = torch.cat([angle.cos().mul_(radius), angle.sin_().mul_(radius)], 1)
-    return both[:, :count].reshape(len(seeds), *shape)
+    both = torch.stack([angle.cos(), angle.sin_()], 1).mul_(radius[:, None])
+    return both.flatten(1)[:, :count].reshape(len(seeds), *shape)
 
 
 def choice(seeds: torch.Tensor, probabilities: torch.Tensor, stream: int = 0) -> torch.Tensor:
@@ -58,23 +58,26 @@ def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor,
 
 def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The same as `_halves` in plain tensor algebra, for GPUs."""
-    key = _hashed(seeds + constant(_stream, seeds.device, stream))[:, None]
-    mixed = _hashed(key + constant(_steps, seeds.device, count))
-    high, low = (mixed >> 40) & 0xFFFFFF, (mixed >> 8) & 0xFFFFFF
-    return high.float() * 2.0**-24, low.float() * 2.0**-24
+    key = _mixed(seeds + constant(_stream, seeds.device, stream))[:, None]
+    mixed = _mixed(key + constant(_steps, seeds.device, count))[None]
+    high, low = (((mixed >> constant(_shifts, seeds.device)) & 0xFFFFFF) * 2.0**-24).unbind(0)
+    return high, low
 
 
 def _stream(number: int) -> torch.Tensor:
-    return _hashed(torch.tensor(number))
+    return _mixed(torch.tensor(number) + GOLDEN) + GOLDEN
 
 
 def _steps(count: int) -> torch.Tensor:
-    return torch.arange(count) * GOLDEN
+    return torch.arange(count) * GOLDEN + GOLDEN
 
 
-def _hashed(x: torch.Tensor) -> torch.Tensor:
-    """splitmix64's mixing of int64; a shift to the right brings in zeros."""
-    x = x + GOLDEN
+def _shifts() -> torch.Tensor:
+    return torch.tensor([40, 8])[:, None, None]
+
+
+def _mixed(x: torch.Tensor) -> torch.Tensor:
+    """splitmix64 of int64, but for its first addition; a shift to the right brings in zeros."""
     x = (x ^ ((x >> 30) & (2**34 - 1))) * FIRST
     x = (x ^ ((x >> 27) & (2**37 - 1))) * SECOND
     return x ^ ((x >> 31) & (2**33 - 1))

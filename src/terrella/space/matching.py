@@ -2,7 +2,7 @@
 
 import torch
 
-from ..core.backend import kernels_do
+from ..core.backend import constant, kernels_do
 from .kernels_numba.matching import edge_shares as edge_shares_kernel
 from .views import arrays, each_view
 
@@ -23,10 +23,11 @@ def edge_shares_slowly(before: torch.Tensor, after: torch.Tensor, moves: torch.T
     """The same as `edge_shares`, in plain tensor algebra, also for GPUs."""
     height, width = after.shape[-2:]
     one, other = before.int(), after.int()
-    steps = (other[..., 1:, 1:] - other[..., :-1, 1:]).abs(), (other[..., 1:, 1:] - other[..., 1:, :-1]).abs()
+    corner = other[..., 1:, 1:]
+    steps = (corner - other[..., :-1, 1:]).abs(), (corner - other[..., 1:, :-1]).abs()
     edges = (torch.maximum(*steps).amax(1) > TEXTURED)[:, ::2, ::2].flatten(1)
-    x = torch.arange(width, device=after.device) - moves[:, :1]
-    y = torch.arange(height, device=after.device) - moves[:, 1:]
+    x = constant(torch.arange, after.device, width) - moves[:, :1]
+    y = constant(torch.arange, after.device, height) - moves[:, 1:]
     shifted = one[:, :, y.clamp(0, height - 1)[:, :, None], x.clamp(0, width - 1)[:, None]]  # [B, 3, M, H, W]
     off = (shifted - other[:, :, None]).abs().amax(1)
     off = torch.maximum(torch.maximum(off[..., 1:, 1:], off[..., :-1, 1:]), off[..., 1:, :-1])[..., ::2, ::2]

@@ -4,7 +4,7 @@ A pixel holds its most frequent colour (a majority vote, Boyer and Moore 1981), 
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import kernels_do
+from ..core.backend import constant, kernels_do
 from .kernels_numba.matching import update_mosaic as update_mosaic_kernel
 from .views import arrays, each_view
 
@@ -33,13 +33,13 @@ def update_mosaic_slowly(
     """The same as `update_mosaic`, in plain tensor algebra, also for GPUs."""
     size = frame.shape[-2:]
     after = _window(mosaic, move, mosaic.shape[-2:])
-    seen = _window(after, torch.zeros_like(move), size)
+    top, left = middle(mosaic, size)
+    seen = after[..., top : top + size[0], left : left + size[1]]
     votes = seen[:, 3:].int()
     same = (seen[:, :3].int() - frame.int()).abs().amax(1, keepdim=True) <= SAME
     agree, outvoted = same & (votes > 0), votes > 1
     colour = torch.where(agree | outvoted, seen[:, :3], frame)
     votes = torch.where(agree, (votes + 1).clamp_max(MOST), torch.where(outvoted, votes - 1, 1))
-    top, left = middle(mosaic, size)
     joined = torch.where(over, seen, torch.cat([colour, votes.to(torch.uint8)], 1))
     after[..., top : top + size[0], left : left + size[1]] = joined
     return after
@@ -55,10 +55,11 @@ def _window(mosaic: torch.Tensor, move: torch.Tensor, size) -> torch.Tensor:
     """The middle `size` of mosaics displaced by `move`."""
     tall, wide = mosaic.shape[-2:]
     top, left = middle(mosaic, size)
-    y = torch.arange(top, top + size[0], device=mosaic.device) - move[:, 1:]
-    x = torch.arange(left, left + size[1], device=mosaic.device) - move[:, :1]
-    inside = ((y >= 0) & (y < tall))[:, :, None] & ((x >= 0) & (x < wide))[:, None]
-    place = y.clamp(0, tall - 1)[:, :, None] * wide + x.clamp(0, wide - 1)[:, None]
+    y = constant(torch.arange, mosaic.device, top, top + size[0]) - move[:, 1:]
+    x = constant(torch.arange, mosaic.device, left, left + size[1]) - move[:, :1]
+    near_y, near_x = y.clamp(0, tall - 1), x.clamp(0, wide - 1)
+    inside = (y == near_y)[:, :, None] & (x == near_x)[:, None]
+    place = near_y[:, :, None] * wide + near_x[:, None]
     window = mosaic.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 4, -1)).unflatten(2, tuple(size))
     return window * inside[:, None]
 

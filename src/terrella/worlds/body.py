@@ -8,6 +8,7 @@ from typing import final
 import torch
 from torch import nn
 
+from ..core.backend import constant
 from ..core.spec import POSE, POSE_UNIT
 from ..core.state import State
 from ..space.camera import planar_pose, yaw
@@ -110,7 +111,7 @@ class NoBody(Absent):
         return {}
 
     def ends(self, after: State, action: torch.Tensor) -> torch.Tensor:
-        return torch.zeros(len(action), dtype=torch.bool, device=action.device)
+        return constant(torch.tensor, action.device, False).expand(len(action))
 
 
 def follow_stairs(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:

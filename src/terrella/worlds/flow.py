@@ -10,6 +10,7 @@ what left the picture. Where several cameras overlap, their pictures are made to
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
@@ -17,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ..core.backend import constant
 from ..space.mosaic import read_mosaic
 from ..space.overlap import Blend, MountedCamera
 from .generator import Conditioning, encode_depth, parts_of
@@ -51,6 +53,10 @@ class FlowFeatures(NamedTuple):
     embedding: torch.Tensor  # [B, WIDE] of the actions
     base: torch.Tensor  # [B, 3, H, W] in -1..1: the last frame, or `carry` of it where pictures scroll
     older: torch.Tensor  # [B, 3, H, W]: the frame before
+    remembered: torch.Tensor | None  # [B, 4, H, W]: memory relative to the base, 0 where unknown, and whether known
+
+
+Modulation = tuple[torch.Tensor, torch.Tensor]  # by which a block scales and shifts its maps [B, C, 1, 1]
 
 
 class AdaptiveBlock(nn.Module):
@@ -64,8 +70,18 @@ class AdaptiveBlock(nn.Module):
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: torch.Tensor, embedding: torch.Tensor) -> torch.Tensor:
-        scale, shift = self.embedding(embedding)[:, :, None, None].chunk(2, 1)
-        return x + self.second(F.silu(self.first(F.silu(self.norm(x) * (1 + scale) + shift))))
+        return self.modulated(x, modulations((self,), embedding)[0])
+
+    def modulated(self, x: torch.Tensor, by: Modulation) -> torch.Tensor:
+        scale, shift = by
+        return x + self.second(F.silu(self.first(F.silu(torch.addcmul(shift, self.norm(x), scale)))))
+
+
+def modulations(blocks: Sequence[AdaptiveBlock], embedding: torch.Tensor) -> list[Modulation]:
+    """Of each block by an embedding [B, WIDE]."""
+    halves = [block.embedding(embedding)[..., None, None].chunk(2, -3) for block in blocks]
+    scales = torch._foreach_add([scale for scale, _ in halves], 1.0)
+    return [(scale, shift) for scale, (_, shift) in zip(scales, halves)]
 
 
 @final
@@ -112,32 +128,39 @@ class FlowNetwork(nn.Module):
         """Of frames [B, slots, 3, H, W] in -1..1, the newest first, the context [B, n], by which move int64 [B] most of the picture
         goes on, and memory uint8 [B, 4, H, W]: colours of the next frame and whether (over 0) they are known."""
         embedding = self.actions(context)
-        fine = self.before[0](self.enter(self._padded(frames.flatten(1, 2))), embedding)
-        middle = self.before[1](self.down[0](fine), embedding)
-        coarse = self.before[2](self.down[1](middle), embedding)
+        first, second, third = self._blocks("before")
+        by = modulations((first, second, third), embedding)
+        fine = first.modulated(self.enter(self._padded(frames.flatten(1, 2))), by[0])
+        middle = second.modulated(self.down[0](fine), by[1])
+        coarse = third.modulated(self.down[1](middle), by[2])
         tokens = coarse.flatten(2).transpose(1, 2)
         attended = self.attention(tokens, tokens, tokens, need_weights=False)[0]
         coarse = coarse + attended.transpose(1, 2).unflatten(2, coarse.shape[-2:])
         base = frames[:, 0] if scroll is None else carry(frames[:, 0], scroll, self.moves, self.over, memory)
-        return FlowFeatures((fine, middle, coarse), embedding, base, frames[:, min(1, frames.shape[1] - 1)])
+        remembered = self._remembered(memory, base) if self.config.moves else None
+        older = frames[:, min(1, frames.shape[1] - 1)]
+        return FlowFeatures((fine, middle, coarse), embedding, base, older, remembered)
 
-    def clean(
-        self, seen: FlowFeatures, noisy: torch.Tensor, time: torch.Tensor, memory: torch.Tensor | None
-    ) -> torch.Tensor:
-        """The clean frame [B, 3, H, W] in -1..1 by `noisy` of the same shape at flow time [B]. memory: as in `encode`."""
-        (fine, middle, coarse), embedding, base, older = seen
-        angle = time[:, None] * (2.0 ** torch.arange(FREQUENCIES, device=time.device)) * (math.pi / 2)
-        embedding = embedding + self.time(torch.cat([angle.sin(), angle.cos()], 1))
-        entering = [noisy - base, base, *([self._remembered(memory, base)] if self.config.moves else [])]
-        fine = self.drawn(fine + self.enter_drawn(self._padded(torch.cat(entering, 1))), embedding)
+    def clean(self, seen: FlowFeatures, noisy: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
+        """The clean frame [B, 3, H, W] in -1..1 by `noisy` of the same shape at flow time [B]."""
+        return self._cleaned(seen, noisy, modulations(self._drawing, seen.embedding + self.time(_waves(time))))
+
+    def _cleaned(self, seen: FlowFeatures, noisy: torch.Tensor, by: Sequence[Modulation]) -> torch.Tensor:
+        """`clean` with the modulations of its blocks at a flow time."""
+        (fine, middle, coarse), _, base, older, remembered = seen
+        drawn, *after = self._drawing
+        change = noisy - base
+        entering = [change, base, *([] if remembered is None else [remembered])]
+        fine = drawn.modulated(fine + self.enter_drawn(self._padded(torch.cat(entering, 1))), by[0])
         middle = middle + self.down_drawn[0](fine)
-        x = self.after[0](coarse + self.down_drawn[1](middle), embedding)
-        x = self.after[1](middle + F.pixel_shuffle(self.up[0](x), 2), embedding)
-        x = self.after[3](self.after[2](fine + F.pixel_shuffle(self.up[1](x), 2), embedding), embedding)
+        x = after[0].modulated(coarse + self.down_drawn[1](middle), by[1])
+        x = after[1].modulated(middle + F.pixel_shuffle(self.up[0](x), 2), by[2])
+        x = after[2].modulated(fine + F.pixel_shuffle(self.up[1](x), 2), by[3])
+        x = after[3].modulated(x, by[4])
         height, width = self.config.size
         detail = F.pixel_shuffle(self.detail(x), SQUARE)[..., :height, :width]
-        near = torch.cat([detail, noisy - base, base, older], 1).contiguous(memory_format=torch.channels_last)
-        return base + self.output(F.silu(self.near(near))).float()
+        near = self.near(torch.cat([detail, change, base, older], 1))
+        return base + self.output(F.silu(near)).float()
 
     def draw(self, noise: torch.Tensor, conditioning: Conditioning, steps: int | None = None) -> torch.Tensor:
         """The next frame in the generator's code [B, 4, H, W], drawn from `noise` [B, 4, H, W] in `steps` steps, by default
@@ -148,24 +171,34 @@ class FlowNetwork(nn.Module):
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]) * ~self.over
-        x = self.sample(conditioning.glimpse.rgb * 2 - 1, conditioning.context, scroll, memory, noise[:, :3], steps)
-        return torch.cat([x, encode_depth(conditioning.glimpse.depth)[:, None]], 1)
+        rgb = torch.add(constant(torch.tensor, noise.device, -1.0), conditioning.glimpse.rgb, alpha=2)
+        x = self.sample(rgb, conditioning.context, scroll, memory, noise[:, :3], steps)
+        return torch.cat([x, constant(_no_depth, x.device, *self.config.size).expand(len(x), -1, -1, -1)], 1)
 
     def sample(self, frames, context, scroll, memory, noise: torch.Tensor, steps: int) -> torch.Tensor:
         """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. The rest: as in `encode`."""
         seen = self.encode(frames, context, scroll, memory)
-        time = torch.zeros(len(noise), device=noise.device)
         agreed = self.blend or (lambda x: x)  # after each step, as in MultiDiffusion (Bar-Tal et al. 2023)
         noise = noise if self.blend is None else self.blend.noise(noise)
-        x = agreed(self.clean(seen, seen.base, time, memory))
-        for step in range(1, steps):
-            t = step / steps
-            x = agreed(self.clean(seen, (1 - t) * noise + t * x.clamp(-1, 1), time + t, memory))
+        times = self.time(constant(_waves_of_steps, noise.device, steps))
+        whole = modulations(self._drawing, seen.embedding[:, None] + times)  # of all steps
+        x = seen.base
+        for step in range(steps):
+            noisy = torch.lerp(noise, x.clamp(-1, 1), step / steps) if step else x
+            x = agreed(self._cleaned(seen, noisy, [(scale[:, step], shift[:, step]) for scale, shift in whole]))
         x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
         if memory is not None:
-            known = memory[:, :3].float() / 127.5 - 1
+            known = memory[:, :3] / 127.5 - 1
             x = torch.where(_alike(x, known, RECALLED) & (memory[:, 3:] > 0), known, x)
         return x
+
+    @property
+    def _drawing(self) -> tuple[AdaptiveBlock, ...]:
+        """The blocks of a drawing step, in their order."""
+        return (self.drawn, *self._blocks("after"))
+
+    def _blocks(self, name: str) -> tuple[AdaptiveBlock, ...]:
+        return tuple(getattr(self, name))
 
     def prepare(self, conditioning: Conditioning) -> Conditioning:
         """With `scroll`, the move by which most of the picture goes on, where pictures scroll."""
@@ -178,7 +211,7 @@ class FlowNetwork(nn.Module):
         if memory is None:
             return base.new_zeros(len(base), 4, *base.shape[-2:])
         known = (memory[:, 3:] > 0).float()
-        return torch.cat([(memory[:, :3].float() / 127.5 - 1 - base) * known, known], 1)
+        return torch.cat([(memory[:, :3] / 127.5 - 1 - base) * known, known], 1)
 
     def _padded(self, maps: torch.Tensor) -> torch.Tensor:
         """Maps [B, C, H, W] with replicated edges where a side is no multiple of 16."""
@@ -186,7 +219,22 @@ class FlowNetwork(nn.Module):
         below, right = -height % (4 * SQUARE), -width % (4 * SQUARE)
         if below or right:
             maps = F.pad(maps, (0, right, 0, below), mode="replicate")
-        return maps.contiguous(memory_format=torch.channels_last)
+        return maps
+
+
+def _waves(time: torch.Tensor) -> torch.Tensor:
+    """Flow times [B] as sines and cosines [B, 2 * FREQUENCIES]."""
+    angle = time[:, None] * (2.0 ** torch.arange(FREQUENCIES, device=time.device)) * (math.pi / 2)
+    return torch.cat([angle.sin(), angle.cos()], 1)
+
+
+def _waves_of_steps(steps: int) -> torch.Tensor:
+    return _waves(torch.arange(steps) / steps)
+
+
+def _no_depth(height: int, width: int) -> torch.Tensor:
+    """The code of the depth of a world of frames alone, 1 m everywhere."""
+    return encode_depth(torch.ones(1, 1, height, width))
 
 
 def carry(
@@ -201,14 +249,15 @@ def carry(
     at the nearest edge."""
     height, width = last.shape[-2:]
     along = moves[torch.where(over, 0, scroll[:, None, None])]  # [B, H, W, 2]
-    x = torch.arange(width, device=last.device) - along[..., 0]
-    y = torch.arange(height, device=last.device)[:, None] - along[..., 1]
-    place = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
+    x = constant(torch.arange, last.device, width) - along[..., 0]
+    y = constant(torch.arange, last.device, height)[:, None] - along[..., 1]
+    near_x, near_y = x.clamp(0, width - 1), y.clamp(0, height - 1)
+    place = near_y * width + near_x
     carried = last.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
     if memory is None:
         return carried
-    new = (x < 0) | (x >= width) | (y < 0) | (y >= height) | over.flatten()[place] & ~over
-    return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3].float() / 127.5 - 1, carried)
+    new = (x != near_x) | (y != near_y) | over.flatten()[place] & ~over
+    return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3] / 127.5 - 1, carried)
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor, most: float) -> torch.Tensor:

@@ -148,15 +148,15 @@ class FrameHistory:
 
     def walls(self, state: State) -> tuple[State, Walls]:
         """No walls, and the same state."""
-        nothing = torch.zeros(state.batch, 0, 4, device=self.device)
-        return state, Walls(nothing[0], nothing)
+        nothing = constant(torch.zeros, self.device, 1, 0, 4)
+        return state, Walls(nothing[0], nothing.expand(state.batch, -1, -1))
 
     def look(self, state: State, before: State) -> Conditioning:
         """The last frames in the place of keyframes; `familiar` is 0, since they lie in no place."""
         frames, actions = state["frames"], state["actions"].flip(1)
         context = torch.cat([context_thumbnail(frames[:, 0]), actions.flatten(1)], 1)
-        last = torch.zeros(len(frames), 4, *self.config.size, device=frames.device)
-        familiar = torch.zeros(state.batch, 2, device=self.device)
+        last = constant(torch.zeros, frames.device, 1, 4, *self.config.size).expand(len(frames), -1, -1, -1)
+        familiar = constant(torch.zeros, self.device, 1, 2).expand(state.batch, -1)
         mosaic = self._joined(state) if self.config.moves else None
         return Conditioning(glimpse_of_frames(frames), last, context, familiar, mosaic)
 
@@ -206,10 +206,13 @@ def _shown(mosaic: torch.Tensor) -> torch.Tensor:
     return torch.cat([mosaic[:, :3], seen], 1).permute(0, 2, 3, 1).contiguous()
 
 
+def _trust(slots: int) -> torch.Tensor:
+    return TRUST ** torch.arange(slots, dtype=torch.float32)
+
+
 def glimpse_of_frames(frames: torch.Tensor) -> Glimpse:
     """The last frames (uint8 [B, slots, 3, H, W], the newest first) as a Glimpse."""
     batch, slots, _, height, width = frames.shape
-    trust = TRUST ** torch.arange(slots, dtype=torch.float32, device=frames.device)
-    everywhere = torch.ones(batch, height, width, device=frames.device)
-    trust = trust[None, :, None, None].expand(batch, -1, height, width)
-    return Glimpse(frames.float() / 255, trust, everywhere, everywhere)
+    everywhere = constant(torch.ones, frames.device, 1, height, width).expand(batch, -1, -1)
+    trust = constant(_trust, frames.device, slots)[None, :, None, None].expand(batch, -1, height, width)
+    return Glimpse(frames / 255, trust, everywhere, everywhere)

@@ -183,7 +183,7 @@ def decode_depth(code: torch.Tensor) -> torch.Tensor:
 def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
     """Frames uint8 [B, 3, H, W] as tiny pictures in [-1, 1]: [B, 36]. Where nothing is known of a view, the last frame is the
     best hint of how the place looks."""
-    return F.adaptive_avg_pool2d(rgb.float() / 127.5 - 1, THUMBNAIL).flatten(1)
+    return F.adaptive_avg_pool2d(rgb / 127.5 - 1, THUMBNAIL).flatten(1)
 
 
 def pixels(clean: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from ..core import chance
+from ..core.backend import constant
 from ..core.deferred import Deferred, Step
 from ..core.errors import ContractError
 from ..core.spec import Camera, Spec
@@ -230,9 +231,10 @@ class LearnedWorld:
         after = after.replace(**self.objects.step(state, after, seeds), gone=drift(state, after, led=False))
         after = self._draw(after, state, seeds, still)
         after = after.replace(**self.outcome.step(state, after, ends, numbers, seeds))
-        at_hand = [name for name in after if name not in self._drawn_names and after[name] is not state[name]]
-        kept = {name: _where(still, state[name], after[name]) for name in at_hand}
-        return after.replace(**{**kept, "reward": torch.where(still, 0.0, after["reward"])})
+        others = [name for name in after if name not in (*self._drawn_names, "reward")]
+        kept = {name: _where(still, state[name], after[name]) for name in others if after[name] is not state[name]}
+        nothing = constant(torch.tensor, self.device, 0.0)
+        return after.replace(**kept, reward=torch.where(still, nothing, after["reward"]))
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, torch.Tensor]:
         self.spec.check_channels(channels)

@@ -53,7 +53,11 @@ class ConstantOutcome:
         self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
     ) -> Tensors:
         """Reward and end of a step that `ends` [B] or does not; no frame is read."""
-        return {"done": before["done"] | ends, "reward": self.config.usual + self.config.ending * ends.float()}
+        usual, last = (
+            constant(torch.tensor, ends.device, reward)
+            for reward in (self.config.usual, self.config.usual + self.config.ending)
+        )
+        return {"done": before["done"] | ends, "reward": torch.where(ends, last, usual)}
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         return {}
@@ -160,8 +164,8 @@ class FrameOutcome(nn.Module):
 
     def seen(self, before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
         """Features [B, 128] of two frames uint8 [B, 3, H, W]."""
-        small = [_shrunk(frame, self.config.side) for frame in (before, after)]
-        x = F.pixel_unshuffle(torch.cat([small[1], small[1] - small[0]], 1), 2)
+        first, second = _shrunk(torch.cat([before, after]), self.config.side).chunk(2)
+        x = F.pixel_unshuffle(torch.cat([second, second - first], 1), 2)
         for layer in self.look:
             x = F.silu(layer(x))
         return F.silu(self.sum_up(F.adaptive_avg_pool2d(x, 4).flatten(1)))
@@ -214,5 +218,5 @@ def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:
     height, width = frame.shape[-2:]
     share = min(1.0, side / max(height, width))
     size = [max(8, 2 * round(length * share / 2)) for length in (height, width)]
-    picture = frame.float() / 127.5 - 1
+    picture = frame / 127.5 - 1
     return picture if size == [height, width] else F.interpolate(picture, size, mode="area")

@@ -26,7 +26,7 @@ class Scroll(nn.Module):
 
     def frame_features(self, frame: torch.Tensor) -> torch.Tensor:
         """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
-        return self.glance(frame.float() / 127.5 - 1)
+        return self.glance(frame / 127.5 - 1)
 
     def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
         """Logits [B, moves + 1]. seen: of `frame_features`; went [B, slots - 1, moves + 1]: how well each move explained each
@@ -38,8 +38,8 @@ class Scroll(nn.Module):
 def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Tensor) -> torch.Tensor:
     """By which of the `moves` int64 [K, 2] most of the picture goes on: int64 [B]."""
     frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)  # the newest first
-    went = [edge_shares(one, other, moves) for one, other in zip(frames.unbind(1)[1:], frames.unbind(1))]
-    logits = scroll(scroll.frame_features(frames[:, 0]), conditioning.context, torch.stack(went, 1))
+    went = edge_shares(frames[:, 1:].flatten(0, 1), frames[:, :-1].flatten(0, 1), moves).unflatten(0, (len(frames), -1))
+    logits = scroll(scroll.frame_features(frames[:, 0]), conditioning.context, went)
     return least_off(logits, moves)
 
 

@@ -139,7 +139,7 @@ class FlowFrames:
         frames = frames + level * now.randn(*frames.shape)
         with now.half():
             seen = self._encode(frames, context, scroll, memory)
-            draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device), memory)
+            draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device))
         parts = {"draft": self._error(draft, clean, base, changes)}
         if now.share < DRAFTS:
             return Loss("generator", parts["draft"], parts)
@@ -147,7 +147,7 @@ class FlowFrames:
         share = t[:, None, None, None]
         noisy = (1 - share) * now.randn(*clean.shape) + share * clean
         with now.half():
-            drawn = self._clean(seen, noisy, t, memory)
+            drawn = self._clean(seen, noisy, t)
         parts["drawn"] = self._error(drawn, clean, base, changes)
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
 
