@@ -43,11 +43,11 @@ def latent(pictures: bool) -> LatentWorld:
 
 
 WORLDS = {
-    "doom-maze": (lambda: terrella.load("doom-maze"), 1800),
-    "doom-corridor": (lambda: terrella.load("doom-corridor"), 2600),
+    "doom-maze": (lambda: terrella.load("doom-maze"), 1530),
+    "doom-corridor": (lambda: terrella.load("doom-corridor"), 2180),
     "flow": (lambda: flow(0), 300),
-    "flow that scrolls": (lambda: flow(15), 1000),
-    "islet": (lambda: terrella.load("islet"), 1000),
+    "flow that scrolls": (lambda: flow(15), 450),
+    "islet": (lambda: terrella.load("islet"), 600),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }

@@ -13,8 +13,8 @@ NEAR_M = 0.05  # nearer surfaces are not drawn
 FAR_M = 100.0  # the depth of pixels where nothing is known
 SAME = 0.06  # depths that differ by less than this share belong to one surface
 
-_STAY = torch.eye(3)
-_TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a unit quaternion to its rotation minus the identity
+_STAY = torch.eye(3).flatten()
+_TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a quaternion to its rotation minus the identity
     [
         [[[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, -2], [0, 2, 0]],
          [[0, 0, 2], [0, 0, 0], [-2, 0, 0]], [[0, -2, 0], [2, 0, 0], [0, 0, 0]]],
@@ -27,6 +27,10 @@ _TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a unit qua
     ],
     dtype=torch.float32,
 ).view(16, 9)  # fmt: skip
+_TURN = torch.cat([_TURN, torch.eye(4).view(16, 1)], 1)  # times its squared length, which comes last
+_HEADING = torch.zeros(16, 2)  # sine and cosine of the heading, less (0, 1/2)
+_AHEAD = torch.tensor([0.0, 0.5])
+_HEADING[[3, 6], 0], _HEADING[[10, 15], 1] = 1.0, -1.0
 
 
 def rays(camera: Intrinsics, height: int, width: int, device=None) -> torch.Tensor:
@@ -43,26 +47,31 @@ def _rays(camera: Intrinsics, height: int, width: int) -> torch.Tensor:
 
 def rotation(pose: torch.Tensor) -> torch.Tensor:
     """Rotation matrices of T_world_cam: [..., 7] -> [..., 3, 3]."""
-    quaternion = pose[..., 3:]
-    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    products = (quaternion[..., :, None] * quaternion[..., None, :]).flatten(-2)
     turn, stay = (constant(part.to, pose.device, pose.dtype) for part in (_TURN, _STAY))
-    return (products @ turn).unflatten(-1, (3, 3)) + stay
+    turned = _products(pose) @ turn
+    return torch.addcdiv(stay, turned[..., :9], turned[..., 9:].clamp_min(1e-24)).unflatten(-1, (3, 3))
+
+
+def _products(pose: torch.Tensor) -> torch.Tensor:
+    """ww, wx, wy, wz, xw, ... of the quaternions [..., 16]."""
+    quaternion = pose[..., 3:]
+    return (quaternion[..., :, None] * quaternion[..., None, :]).flatten(-2)
 
 
 def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
     """Depth [..., H, W] seen from `pose` [..., 7] -> world points [..., H, W, 3]."""
-    points = depth[..., None] * rays(camera, *depth.shape[-2:], device=depth.device)
-    return (points.flatten(-3, -2) @ rotation(pose).mT + pose[..., None, :3]).view(points.shape)
+    points = (depth[..., None] * rays(camera, *depth.shape[-2:], device=depth.device)).flatten(-3, -2)
+    eye, turn = pose[..., None, :3].reshape(-1, 1, 3), rotation(pose).mT.reshape(-1, 3, 3)
+    return torch.baddbmm(eye, points.reshape(-1, *points.shape[-2:]), turn).view(*depth.shape, 3)
 
 
 def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
     """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N]. Points
     behind the camera have depth <= 0 and meaningless coordinates."""
-    local = (points - pose[..., None, :3]) @ rotation(pose)
+    scale, middle = (constant(table, pose.device, *row) for row in ((1.0, -camera[0], -camera[1]), camera[2:]))
+    local = (points - pose[..., None, :3]) @ (rotation(pose) * scale)
     depth = local[..., 0]
-    focal, middle = (constant(table, depth.device, *pair) for pair in (camera[:2], camera[2:]))
-    return middle - focal * local[..., 1:] / depth.clamp_min(1e-4)[..., None], depth
+    return torch.addcdiv(middle, local[..., 1:], depth.clamp_min(1e-4)[..., None]), depth
 
 
 def relative_pose(body: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:
@@ -76,8 +85,10 @@ def relative_pose(body: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:
 
 def yaw(pose: torch.Tensor) -> torch.Tensor:
     """Heading in radians, counter-clockwise from world x: [..., 7] -> [...]."""
-    w, x, y, z = pose[..., 3:].unbind(-1)
-    return torch.atan2(w * z + x * y, 0.5 - (y * y + z * z))
+    facing, ahead = (constant(part.to, pose.device, pose.dtype) for part in (_HEADING, _AHEAD))
+    return torch.atan2(
+        *torch.addmm(ahead, _products(pose).reshape(-1, 16), facing).view(*pose.shape[:-1], 2).unbind(-1)
+    )
 
 
 def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:

@@ -44,9 +44,10 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     sides, slope, level = (part.gather(-1, order.expand(part.shape)) for part in (sides, slope, level))
     ahead = 1 / torch.where(most > 0, slope * sides + level, 1.0)
     heading, position = yaw(pose).double()[:, None], pose[:, :2].double()[..., None]
-    x = position[:, 0] + ahead * heading.cos() - ahead * sides * heading.sin()
-    y = position[:, 1] + ahead * heading.sin() + ahead * sides * heading.cos()
-    walls = torch.where(most > 0, torch.stack([x[0], y[0], x[1], y[1]]), NOWHERE).permute(1, 2, 0)[:, :WALLS].float()
+    cosine, sine, beside = heading.cos(), heading.sin(), ahead * sides
+    x = torch.addcmul(torch.addcmul(position[:, 0], ahead, cosine), beside, sine, value=-1)
+    y = torch.addcmul(torch.addcmul(position[:, 1], ahead, sine), beside, cosine)
+    walls = where(most > 0, torch.stack([x[0], y[0], x[1], y[1]]), NOWHERE).permute(1, 2, 0)[:, :WALLS].float()
     return F.pad(walls, (0, 0, 0, WALLS - walls.shape[1]), value=NOWHERE)
 
 
@@ -123,8 +124,8 @@ def _corners(first, stop, slope, level, left) -> torch.Tensor:
     meet = (stop[:, other] > 0) & (first[:, other] - stop[:, one] <= 2) & (slope[:, one] != slope[:, other])
     corner = (level[:, other] - level[:, one]) / torch.where(meet, slope[:, one] - slope[:, other], 1.0)
     meet &= (corner >= left[(first[:, other] + 1).clamp_max(last)]) & (corner <= left[(stop[:, one] - 2).clamp_min(0)])
-    meet &= _apart(corner, end[:, one], slope[:, one], level[:, one]) < GAP_M
-    meet &= _apart(corner, begin[:, other], slope[:, other], level[:, other]) < GAP_M
+    lines = [torch.stack([part[:, one], part[:, other]]) for part in (slope, level)]
+    meet &= (_apart(corner, torch.stack([end[:, one], begin[:, other]]), *lines) < GAP_M).all(0)
     begin = torch.cat([begin[:, :1], torch.where(meet, corner, begin[:, other])], 1)
     return torch.stack([begin, torch.cat([torch.where(meet, corner, end[:, one]), end[:, -1:]], 1)])
 
@@ -219,9 +220,12 @@ def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor,
         blocked = share <= 1
         go = where(blocked, (share - short).clamp_min(0), 1.0)
         place = place + go * rest * free
-        onward = (1 - share.clamp_min(0)) * (rest * along).sum(1, keepdim=True) * along * float(bump < 2)
         free = free & blocked
-        rest = torch.where(free, onward, rest)
+        if bump < 2:
+            onward = (1 - share.clamp_min(0)) * (rest * along).sum(1, keepdim=True) * along
+            rest = torch.where(free, onward, rest)
+        else:
+            rest = rest * ~free
     return (place - places).to(wish), rest.to(wish)
 
 
@@ -270,7 +274,8 @@ def _first_touch(sides: _Sides, place: torch.Tensor, move: torch.Tensor) -> tupl
     enter, face = least.masked_fill(still, -1e9).max(-1)
     beside = still & (torch.maximum(low, -high) >= -1e-9)
     leave = most.masked_fill(still, 1e9).masked_fill(beside, -1e9).amin(-1)
-    deep = torch.minimum(enter[..., None] * speed - low, high - enter[..., None] * speed)
+    went = enter[..., None] * speed
+    deep = torch.minimum(went - low, high - went)
     index = face[..., None]
     across = crossing.gather(2, index[..., None].expand(*crossing.shape[:2], 1, 3))[:, :, 0]
     grazes = ((across > 0.02) & (deep < WITHIN_M)).any(-1)

@@ -171,7 +171,7 @@ def vote_slowly(
     where, ahead = project(points[:, None], torch.cat([keys.pose[rows] for keys, rows in keyframes], 1), camera)
     pixel = (where * constant(table, points.device, width, height)).clamp_min(0).nan_to_num(0.0)
     pixel = torch.minimum(pixel, constant(table, points.device, width - 1, height - 1)).long()
-    pixel = pixel[..., 1] * width + pixel[..., 0]
+    pixel = torch.add(pixel[..., 0], pixel[..., 1], alpha=width)
     parts = pixel.split([rows.shape[1] for _, rows in keyframes], 1)
     held = [
         keys.depth.flatten()[rows[..., None] * (height * width) + part] for (keys, rows), part in zip(keyframes, parts)
@@ -188,12 +188,14 @@ def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
     if not votes.shape[1]:
         return torch.full((len(votes), count), -1, device=votes.device)
     votes = torch.cat([votes, ANYWAY * votes.amax(2, keepdim=True)], 2)
-    best, picks = torch.zeros_like(votes[:, :1]), []
-    for _ in range(count):
-        gain, chosen = (votes - best).relu().sum(2).max(1, keepdim=True)
-        picks.append(chosen.masked_fill(gain <= 0, -1))
-        best = torch.maximum(best, votes.take_along_dim(chosen[..., None], 1))
-    return torch.cat(picks, 1)
+    more, gains, picks = votes.relu(), [], []  # what each would add to the votes of those before it
+    for number in range(count):
+        gain, chosen = more.sum(2).max(1, keepdim=True)
+        gains.append(gain)
+        picks.append(chosen)
+        if number + 1 < count:
+            more = (more - more.gather(1, chosen[..., None].expand(-1, -1, more.shape[2]))).relu()
+    return torch.cat(picks, 1).masked_fill(torch.cat(gains, 1) <= 0, -1)
 
 
 # -- what they show ---------------------------------------------------------------------------------------------------
@@ -240,7 +242,7 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
         flags = mine.view(*mine.shape, *[1] * (first.ndim - 1))
         return torch.where(flags, ours, first[torch.where(mine, 0, picks.clamp_min(0))])
 
-    key_depth, poses, rgb = both("depth"), both("pose"), both("rgb", doubled).float().div(255)
+    key_depth, poses, rgb = both("depth"), both("pose"), both("rgb", doubled) / 255
     patch = patches_slowly(key_depth, poses, camera, FINE)
     if len(shared):
         patch = torch.where(mine[..., None, None], patch, shared.fine[torch.where(mine, 0, picks.clamp_min(0))])

@@ -54,17 +54,11 @@ def patches_slowly(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, 
 
 def _shorter_difference(points: torch.Tensor, axis: int) -> torch.Tensor:
     """The shorter of the backward and the forward difference along `axis`, which stays on one surface."""
-    step = points.diff(dim=axis)
+    count = points.shape[axis]
+    step = points.diff(dim=axis).index_select(axis, constant(_clamped, points.device, count - 1, 1))
     long = step.square().sum(-1, keepdim=True)
-    count = step.shape[axis]
-    first, last = (constant(_neighbours, step.device, count, shift) for shift in (-1, 0))
-    shorter = long.index_select(axis, first) < long.index_select(axis, last)
-    return torch.where(shorter, step.index_select(axis, first), step.index_select(axis, last))
-
-
-def _neighbours(count: int, shift: int) -> torch.Tensor:
-    """Of `count` differences, those before (shift -1) and after (0) each of count + 1 points."""
-    return (torch.arange(count + 1) + shift).clamp(0, count - 1)
+    before, after = (lambda part: part.narrow(axis, 0, count)), (lambda part: part.narrow(axis, 1, count))
+    return torch.where(before(long) < after(long), before(step), after(step))
 
 
 def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
@@ -131,13 +125,14 @@ def _cast_boxes(boxes: torch.Tensor, width: int, pixels: int, canvas: torch.Tens
     number = constant(torch.arange, boxes.device, float(pixels))
     lift, start, wide, area = boxes[..., 12:].unsqueeze(3).unbind(2)
     row = (number / wide).floor()
-    column = number - row * wide
+    column = torch.addcmul(number, row, wide, value=-1)
     anchored, products = boxes[..., :3, None], boxes[..., 3:12].unflatten(2, (3, 3))[..., None]
-    ratios = anchored + products[:, :, :, 1] * column[:, :, None] + products[:, :, :, 2] * row[:, :, None]
+    along = torch.addcmul(anchored, products[:, :, :, 1], column[:, :, None])
+    ratios = torch.addcmul(along, products[:, :, :, 2], row[:, :, None])
     sizes = ratios.abs()
     far = lift / ratios[:, :, 0]
     hit = (sizes[:, :, 1:].amax(2) <= sizes[:, :, 0]) & (far > NEAR_M) & (number < area)
-    pixel = where(hit, row * width + column + start, canvas.shape[1] - 1.0).long()
+    pixel = where(hit, torch.add(column, row, alpha=width) + start, canvas.shape[1] - 1.0).long()
     canvas.scatter_reduce_(1, pixel.flatten(1), far.flatten(1), "amin")
 
 

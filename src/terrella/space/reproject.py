@@ -4,7 +4,7 @@ Keyframes that see another surface at a pixel are masked there."""
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import kernels_do
+from ..core.backend import kernels_do, where
 from .camera import FAR_M, SAME, Intrinsics, project, rotation, unproject
 from .kernels_numba.carried import carry, fetch, splat
 from .kernels_numba.planes import fill
@@ -45,15 +45,15 @@ def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
     depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
     inverse, weight = 1 / depth[:, None], (depth[:, None] < FAR_M).float()
-    stack = []
-    values, weights = inverse * weight, weight
+    stack, both = [], torch.cat([inverse * weight, weight], 1)
     for _ in range(levels):
-        stack.append((values, weights))
-        values, weights = F.avg_pool2d(values, 2, ceil_mode=True), F.avg_pool2d(weights, 2, ceil_mode=True)
-    filled = values / weights.clamp_min(1e-6)
-    for values, weights in reversed(stack):
-        coarse = F.interpolate(filled, size=values.shape[-2:], mode="bilinear", align_corners=False)
-        filled = torch.where(weights > 1e-6, values / weights.clamp_min(1e-6), coarse)
+        stack.append(both)
+        both = F.avg_pool2d(both, 2, ceil_mode=True)
+    filled = both[:, :1] / both[:, 1:].clamp_min(1e-6)
+    for both in reversed(stack):
+        coarse = F.interpolate(filled, size=both.shape[-2:], mode="bilinear", align_corners=False)
+        weight = both[:, 1:]
+        filled = torch.where(weight > 1e-6, both[:, :1] / weight.clamp_min(1e-6), coarse)
     return 1 / filled[:, 0].clamp_min(1 / FAR_M)
 
 
@@ -88,7 +88,7 @@ def warp(
 def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
     """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture."""
     error = (held - ahead).abs() / ahead.clamp_min(0.05)
-    return torch.where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
+    return where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
 
 
 def carry_unknown(
@@ -107,9 +107,7 @@ def carry_unknown(
 
 def carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera) -> torch.Tensor:
     """The same as `carry_unknown`, in plain tensor algebra, also for GPUs and gradients."""
-    colour, agreement, _ = warp(
-        rgb.float().div(255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera
-    )
+    colour, agreement, _ = warp((rgb / 255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera)
     trust = agreement * (1 - known[:, None])
     return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
 

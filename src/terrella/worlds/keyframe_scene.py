@@ -231,7 +231,7 @@ class KeyframeScene:
         """How well the place is known [B, 2]: distance to the nearest recorded keyframe, log(1 + metres), a radian counting as
         two metres; and the share of its own memory that is in use."""
         pose, kept = state["pose"], self.recorded.pose
-        angle = (yaw(kept) - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
+        angle = (self._table[:, 2] - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
         apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY) + 2 * angle.abs()
         nearest = F.pad(apart, (0, 1), value=AWAY_M).amin(1)
         own = self.own.count(state).float() / max(1, self.own.capacity)

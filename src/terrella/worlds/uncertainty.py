@@ -93,7 +93,7 @@ class UncertaintyNetwork(nn.Module):
     def forward(self, maps: torch.Tensor, situation: torch.Tensor) -> torch.Tensor:
         """maps [B, INPUT_MAPS, h, w]; situation [B, S]. Returns the expected error of each cell, 0..1: [B, h/2, w/2]."""
         gain, shift = self.situate(situation)[:, :, None, None].chunk(2, 1)
-        x = F.silu(self.wide(F.silu(self.enter(maps))) * (1 + gain) + shift)
+        x = F.silu(torch.addcmul(shift, self.wide(F.silu(self.enter(maps))), 1 + gain))
         x = F.silu(x + self.wider(x))
         return F.softplus(self.output(x)[:, 0]) + 1e-4
 
@@ -151,7 +151,7 @@ def drift(before: State, after: State, led: bool) -> torch.Tensor:
     if led:
         way = torch.zeros_like(way)
     elif "pose" in after:
-        turn = yaw(after["pose"]) - yaw(before["pose"])
+        turn = torch.sub(*yaw(torch.stack([after["pose"], before["pose"]])).unbind(0))
         metres = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
         way = way + torch.stack([metres, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
     return torch.cat([steps, way, gone[:, 3:]], 1)
