@@ -66,7 +66,7 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
     where that is faster: on busy cores threads wait for each other."""
     began = time.monotonic()
     with TemporaryDirectory() as folder:
-        recipe = _recipe(data, folder, replace(config, hours=0.0), lambda *_: None, config.minutes)
+        recipe = _recipe(data, folder, replace(config, hours=0.0, compile=False), lambda *_: None, config.minutes)
         setup_s, trained = time.monotonic() - began, _Training(recipe)
         rest = sum(stage.share or 0.0 for stage in trained.stages)
         many = torch.get_num_threads()
