@@ -143,8 +143,7 @@ def measured(row: Row, make: Callable[[], Any], settings: Settings) -> Row:
     numbers, seeds = world.controls.encode(action.to(device)), chance.seeds(row.batch, rng, device)
     for _ in range(2):
         state = world.advance(state, numbers, seeds)
-    with Dispatches(device) as count:
-        drawn(world.advance(state, numbers, seeds))
+    count = counted(reference.to("meta"))
     row.kernels, row.waits = count.kernels, count.waits
     step = StepPrograms(world, "inductor" if settings.compile and not settings.cpu else None)
 
@@ -158,6 +157,20 @@ def measured(row: Row, make: Callable[[], Any], settings: Settings) -> Row:
     if row.per_s < row.bar:
         row.profile = profiled(run, settings) | {"call sites": dict(count.by_site.most_common(10))}
     return row
+
+
+def counted(world: Any) -> Dispatches:
+    """What a step and its picture dispatch, on meta tensors."""
+    rng, shown = make_rng(0), [name for name in ("rgb", "reward", "done") if name in world.spec.channels]
+    state, action = world.start(1, rng), world.spec.sample_action(1, rng)
+    for _ in range(2):
+        state = world.imagine(state, action, rng)
+        world.render(state, shown)
+    for arena in state.arenas.values():
+        arena.make_room(1)
+    with Dispatches("meta") as count:
+        world.render(world.imagine(state, action, rng), shown)
+    return count
 
 
 def differing(reference, world, settings: Settings) -> float:
@@ -229,12 +242,6 @@ def robot(row: Row, settings: Settings) -> Row:
     many = world.spec.dt_s / 0.005  # steps of 5 ms in one of the world
     row.per_s, row.way = row.batch * many * runs_per_second(run, settings), "steps of 5 ms"
     return row
-
-
-def drawn(state) -> None:
-    """Has every tensor of the state computed."""
-    for name in state:
-        state[name]
 
 
 def runs_per_second(run: Callable[[], None], settings: Settings) -> float:

@@ -64,7 +64,7 @@ def test_a_training_step_on_a_device_waits_for_nothing_and_copies_nothing(record
     trainer._step(0)  # makes the optimiser's state, and constants
     monkeypatch.setattr(Trainer, "share", DRAFTS + 0.1)
     monkeypatch.setattr(module, "LOG_EVERY", 20)
-    trainer._step(200)
+    trainer._step(201)
     lists.clear()
     with Dispatches("meta") as count:
         parts = trainer._step(201)
