@@ -304,7 +304,7 @@ def main(settings: Settings) -> int:
     if not settings.cpu and not torch.cuda.is_available():
         print("PyTorch finds no CUDA device here; ARGS=--cpu rehearses the script on a CPU.")
         return 2
-    absent = [name for name in ("mujoco_warp", "warp") if not find_spec(name)]
+    absent = [name for name in ("mujoco", "mjlab", "mujoco_warp", "warp") if not find_spec(name)]
     if absent:
         print(f"Without {', '.join(absent)}: MuJoCo on the card is not measured.")
     device = torch.cuda.get_device_name() if not settings.cpu else "CPU (a rehearsal)"
