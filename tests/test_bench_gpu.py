@@ -31,5 +31,5 @@ def test_it_is_rehearsed_without_a_card(tmp_path):
 
 @pytest.mark.slow
 def test_all_of_it_is_rehearsed(tmp_path):
-    rows = rehearsed(tmp_path, "doom-maze", "doom-corridor", "flow", "latent", "arm", "flow training")
+    rows = rehearsed(tmp_path, "doom-maze", "doom-corridor", "islet", "flow", "latent", "arm", "flow training")
     assert all(row["per_s"] > 0 and not row["error"] and row["off"] < 2e-3 for row in rows)
