@@ -174,3 +174,12 @@ def test_a_file_of_one_step_is_refused_and_pictures_of_floats_and_pickles_are_na
     np.savez(tmp_path / "f" / "a.npz", observations=ragged, actions=ACTION)
     with pytest.raises(DatasetError, match="'observations' is left out: it is a pickle, which is not opened"):
         open_source(tmp_path / "f")
+
+
+def test_names_that_no_sensor_can_have_are_changed_and_named(tmp_path):
+    odd = {"observations/a b": STATE, "observations/a_b": STATE[:, :1], "observations/größe": ACTION}
+    saved(tmp_path / "a.npz", {**odd, "actions": ACTION, "terminals": LAST})
+    source = open_source(tmp_path / "a.npz")
+    assert {"observation.a_b", "observation.a_b_2", "observation.gr_e"} <= set(source.sensors)
+    said = [note for note in source.notes if "is called" in note]
+    assert len(said) == 3 and any("'observations/größe' is called 'observation.gr_e'" in note for note in said)

@@ -160,6 +160,9 @@ def columns(
             sensor = own if rows.stored_shape(own) == array.shape[1:] else sensor
         sensors[place] = replace(sensor, name=rows.unique(sensor.name, taken))
         taken.add(sensors[place].name)
+        parts = (part for key in place for part in str(key).split("."))
+        if sensors[place].name != sensor.name or any(rows.clean(part) != part for part in parts):
+            notes.append(f"{what} '{spelled(place)}' is called '{sensors[place].name}'.")
     return sensors, notes
 
 

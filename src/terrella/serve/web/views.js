@@ -38,19 +38,19 @@ export class Views {
     this.ask(show);
   }
 
-  /** The map of the last world that has one; a mosaic only from when more was seen than the picture, or if it was asked for. */
+  /** The map of the last world that has one, from when there is something to show or it was asked for; a mosaic, more than the picture. */
   showMap() {
     const kind = this.worlds.findLast((world) => world.mapped)?.mapped;
-    const waits = kind === 'mosaic' && this.show.map && !this.mosaic.beyond && !this.mapAsked;
+    const waits = this.show.map && !(kind === 'mosaic' ? this.mosaic.beyond : this.places.camera) && !this.mapAsked;
     this.map = kind === 'mosaic' ? this.mosaic : this.places;
     $('map').hidden = !this.show.map || waits;
-    $('map-open').hidden = !kind || waits;
+    $('map-open').hidden = !kind || (kind === 'mosaic' && waits);
   }
 
   async onChart(body) {
     if (!this.show.map) return;
     await this.map.show(body);
-    if (!$('map').hidden || !this.mosaic.beyond) return;
+    if (!$('map').hidden) return;
     this.showMap();
     this.map.draw();
   }
