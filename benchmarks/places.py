@@ -99,9 +99,8 @@ def depth_to_solids(points: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def grow(name: str, text: str, out: Path | None, fill: str, exact: bool) -> None:
+def grow(name: str, place: BuiltPlace, out: Path | None, fill: str, exact: bool) -> None:
     """Figures of one room."""
-    place = built(text)
     pose = place.starts[0].clone()
     pose[2] += EYE_M
     seen = rasterise(place.gaussians, pose[None], (0.5, 0.5, 0.5, 0.5), (384, 384))
@@ -155,8 +154,9 @@ def main() -> None:
         if given.what == "panorama":
             panorama(name, ROOMS[name], given.out)
         else:
+            place = built(ROOMS[name])
             for fill, exact in (("planes", False), ("lifter", False), ("planes", True)):
-                grow(name, ROOMS[name], given.out, fill, exact)
+                grow(name, place, given.out, fill, exact)
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ from terrella.cli import main
 from terrella.core.errors import CheckpointError, TerrellaError
 from terrella.learn.objectives.lifting import LayeredPictures, LiftingObjective
 from terrella.learn.train_step import TrainStep
-from terrella.space.camera import rotation
+from terrella.space.camera import FAR_M, rotation
 from terrella.space.kernels_numba import shapes as kernels
 from terrella.space.kernels_numba.light import first_box
 from terrella.space.lifting import layers as layers_module
 from terrella.space.lifting.layers import PictureLayers, floor_height, layers_of, levelled, to_gaussians
 from terrella.space.lifting.network import Lifter, LifterConfig, load_lifter, save_lifter
+from terrella.space.lifting.prior import fitted_depth
 from terrella.space.lifting.scenes import rotation_of
 from terrella.space.raster import rasterise
 from terrella.workflows.lift_space import doubts, expected_error, place_of
@@ -201,6 +202,18 @@ def test_the_error_to_expect_is_the_one_that_was_measured_with_the_weights(tmp_p
     assert "not measured" in expected_error(load_lifter(tmp_path / "l.safetensors").measured)
 
 
+def test_lifted_depth_fills_what_stereo_leaves_open():
+    layers = a_box_before_a_wall()
+    truth, lifted = layers.depth, 0.4 * layers.depth * torch.linspace(0.9, 1.1, 64)
+    sparse = torch.where(torch.rand(48, 64, generator=torch.Generator().manual_seed(0)) < 0.2, truth, FAR_M)
+    sparse[:, :20] = 0.0
+    fitted = fitted_depth(lifted, sparse)
+    assert fitted is not None and float((fitted / truth - 1).abs().mean()) < 0.03
+    assert fitted_depth(lifted, torch.zeros(48, 64)) is None
+    noise = torch.rand(48, 64, generator=torch.Generator().manual_seed(1)) * 50 + 0.1
+    assert fitted_depth(lifted, noise) is None  # it fits nowhere
+
+
 def shard(file, seed=0, count=8):
     rng = np.random.default_rng(seed)
     depth = np.broadcast_to(rng.uniform(1, 5, (count, 1, 1)), (count, 64, 64)).astype(np.float16)
@@ -266,6 +279,10 @@ def test_one_function_makes_places_of_all_sources(tmp_path):
     assert terrella.generate_place(tmp_path / "t", text="a tiny room", config=small).facts["rooms"] == 1
     with pytest.raises(TerrellaError, match="give one of"):
         terrella.generate_place(tmp_path / "x", text="a room", image=picture)
+    with pytest.raises(TerrellaError, match="got 0"):
+        terrella.generate_place(tmp_path / "x")
+    with pytest.raises(TerrellaError, match="pictures|sharp"):  # a fit needs several
+        terrella.generate_place(tmp_path / "x", images=tmp_path)
     with pytest.raises(TerrellaError, match="LiftSpaceConfig"):
         terrella.generate_place(tmp_path / "x", image=picture, config=small)
 
@@ -287,11 +304,14 @@ def test_photographs_of_all_kinds(tmp_path, capsys):
 
 def test_what_cannot_be_lifted_is_refused_in_one_sentence_and_nothing_is_written(tmp_path, capsys):
     (tmp_path / "text.png").write_text("no picture")
+    (tmp_path / "many").mkdir()
+    picture_file(tmp_path / "many" / "a.png")
     long = picture_file(tmp_path / "long.png", (1280, 64))
     for path, words in (
         (tmp_path / "text.png", "cannot be read"),
         (tmp_path / "none.png", "does not exist; check the path"),
         (long, "4 to 1"),
+        (tmp_path / "many", "terrella space fit"),
     ):
         code, error = lifted(path, tmp_path, capsys)
         assert code != 0 and words in error and not (tmp_path / "place").exists()

@@ -12,6 +12,7 @@ from .camera import Intrinsics, project, rays, rotation
 from .lifting.layers import layers_of, of_pixels
 from .lifting.network import Lifter
 from .lifting.panorama import directions
+from .lifting.prior import fitted_depth
 from .lifting.scenes import rotation_of
 from .raster import Drawing, Gaussians, rasterise
 from .raster.move import quaternion_of
@@ -24,7 +25,6 @@ ROWS = 64  # of panoramas that measure coverage
 YAWS, PITCHES = 12, (-1.2, -0.6, 0.0, 0.6, 1.2)
 LEAST_KNOWN = 0.4  # share of a view
 FREE_M, FREE = 0.1, 0.05  # what lies this much before a known surface would cover it: metres, and a share
-TILT = 0.05  # resists a tilt of a lifted view, as a share of its weight
 
 Fill = Callable[[Drawing, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
@@ -89,19 +89,9 @@ def lifted_fill(lifter: Lifter) -> Fill:
         known = alpha >= KNOWN
         picture = push_pull(drawn.rgb[0] / alpha.clamp_min(KNOWN), known).clamp(0, 1)
         layers = layers_of((255 * picture.permute(1, 2, 0)).byte().numpy(), lifter, CAMERA[0])
-        off = (drawn.depth[0] / alpha.clamp_min(1e-3)).clamp_min(0.05).log() - layers.depth.log()
-        row, column = torch.meshgrid(*(torch.linspace(-1, 1, side) for side in known.shape), indexing="ij")
-        basis = torch.stack([torch.ones_like(row), row, column], -1)[known]
-        values, weight = off[known], torch.ones(int(known.sum()))
-        theta = torch.zeros(3)
-        for _ in range(5):
-            ridge = TILT * float(weight.sum()) * torch.diag(torch.tensor([1e-6, 1.0, 1.0]))
-            theta = torch.linalg.solve(
-                (basis * weight[:, None]).T @ basis + ridge, (basis * weight[:, None]).T @ values
-            )
-            weight = (-((values - basis @ theta) / 0.2).square()).exp() + 1e-3
-        depth = layers.depth * (theta[0] + theta[1] * row + theta[2] * column).exp()
-        return depth, picture
+        surface = torch.where(known, drawn.depth[0] / alpha.clamp_min(1e-3), 0.0)
+        depth = fitted_depth(layers.depth, surface)
+        return layers.depth if depth is None else depth, picture
 
     return fill
 

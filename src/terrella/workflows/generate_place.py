@@ -1,12 +1,18 @@
-"""One function for places: of words, of a layout, of a picture or of a panorama."""
+"""One function for places: of words, of a layout, of one or several pictures, of a panorama or of a video."""
 
 from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import TerrellaError
-from .build_space import BuildSpaceConfig, build_space
+from ..learn.recipes.splat_views import SplatFit
+from .build_space import BuildSpaceConfig, build_space, fit_space
 from .lift_space import LiftSpaceConfig, lift_space
 from .splat_places import SpaceResult
+
+KINDS: dict[str, type[BuildSpaceConfig | LiftSpaceConfig | SplatFit]] = {
+    "text": BuildSpaceConfig, "layout": BuildSpaceConfig, "image": LiftSpaceConfig, "panorama": LiftSpaceConfig,
+    "images": SplatFit, "video": SplatFit,
+}  # fmt: skip
 
 
 def generate_place(
@@ -16,21 +22,27 @@ def generate_place(
     layout: str | Path | None = None,
     image: str | Path | None = None,
     panorama: str | Path | None = None,
-    config: BuildSpaceConfig | LiftSpaceConfig | None = None,
+    images: str | Path | None = None,
+    video: str | Path | None = None,
+    config: BuildSpaceConfig | LiftSpaceConfig | SplatFit | None = None,
 ) -> SpaceResult:
-    """Makes a place in the folder `out`, as `terrella space build` (of `text` or a `layout` file) and `terrella space lift` (of an
-    `image` or `panorama` file) do; `terrella.load(out)` opens it. TerrellaError unless exactly one of them is given, with its own
-    config."""
-    picture = panorama if image is None else image
-    if sum(one is not None for one in (text, layout, image, panorama)) != 1:
-        raise TerrellaError("give one of text=, layout=, image= and panorama=.")
-    if picture is not None and isinstance(config, LiftSpaceConfig | None):
-        settings = config or LiftSpaceConfig()
-        return lift_space(
-            Path(picture), Path(out), replace(settings, panorama=panorama is not None or settings.panorama)
-        )
-    if picture is None and isinstance(config, BuildSpaceConfig | None):
-        return build_space(text if layout is None else Path(layout), Path(out), config or BuildSpaceConfig())
-    raise TerrellaError(
-        "the config of an image or a panorama is a LiftSpaceConfig, of text and layouts a BuildSpaceConfig."
-    )
+    """Makes a place in the folder `out`, as `terrella space build` (of `text` or a `layout` file), `terrella space lift` (of an
+    `image` or `panorama` file) and `terrella space fit` (of `images`, a folder, or a `video` file: the place is OUT/world) do;
+    `terrella.load(out)` opens it. Fits that were stopped go on. TerrellaError unless exactly one of them is given, with its own
+    config: BuildSpaceConfig, LiftSpaceConfig or SplatFit."""
+    sources = {
+        "text": text, "layout": layout, "image": image, "panorama": panorama, "images": images, "video": video,
+    }  # fmt: skip
+    given = [name for name, source in sources.items() if source is not None]
+    if len(given) != 1:
+        raise TerrellaError(f"give one of {', '.join(f'{name}=' for name in sources)}; got {len(given)} of them.")
+    (name,), settings, out = given, config or KINDS[given[0]](), Path(out)
+    if not isinstance(settings, KINDS[name]):
+        raise TerrellaError(f"the config of {name}= is a {KINDS[name].__name__}, not a {type(settings).__name__}.")
+    source = sources[name]
+    if isinstance(settings, SplatFit):
+        return fit_space(str(source), str(out), settings)
+    if isinstance(settings, LiftSpaceConfig):
+        settings = replace(settings, panorama=name == "panorama" or settings.panorama)
+        return lift_space(Path(str(source)), out, settings)
+    return build_space(text if layout is None else Path(layout), out, settings)

@@ -16,6 +16,7 @@ from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of,
 from ..space.lifting.network import Lifter, load_lifter
 from ..space.lifting.panorama import PanoramaLayers, panorama_gaussians, panorama_layers, wraps
 from ..space.occupancy import Walker
+from ..space.pictures import is_pictures
 from ..space.pictures.reading import read_picture
 from ..space.raster import join
 from ..worlds.additions import INVENTED, OBSERVED
@@ -157,6 +158,10 @@ def doubts(layers: PictureLayers) -> list[str]:
 
 def _frames(picture: Path) -> list[str]:
     """A note on pictures with several frames; DatasetError for a missing or unreadable one."""
+    if is_pictures(picture):
+        raise DatasetError(
+            f"{picture} is a video or a folder of pictures: terrella space fit {picture} makes one place of all."
+        )
     if not picture.exists():
         raise DatasetError(f"{picture} does not exist; check the path.")
     try:

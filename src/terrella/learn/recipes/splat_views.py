@@ -16,11 +16,14 @@ from ...data.format import INFO
 from ...space.camera import FAR_M
 from ...space.files import replace_whole
 from ...space.fitting import FitConfig, PosedViews
+from ...space.lifting.network import load_lifter
+from ...space.lifting.prior import with_prior
 from ...space.pictures import is_pictures, posed_pictures
 from ...space.pictures.posed import FEWEST, to_views
 from ...space.stereo import with_depth
 
 DEPTH_FILE, PICTURES = "depth.safetensors", "pictures"
+FEW = 40  # pictures: with fewer, the lifter gives depth where stereo gives none
 AGREEMENT = 0.08  # share of pixels whose depth agrees between views: with less the poses are wrong, or nothing overlaps
 
 
@@ -75,6 +78,8 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
                 f"the pictures of {data} do not agree on any surface: their poses are wrong, or they overlap too little, or they "
                 "were all taken from one spot."
             )
+        if len(views) < FEW:
+            views = with_prior(views, load_lifter())
     return views, spec, left_out
 
 
