@@ -18,6 +18,7 @@ COLOURS, NEAR, SHARE = 6, 48.0, 0.02  # at most; colours nearer than this are on
 THINGS = 12  # in one picture, at most: the largest
 RING = 2  # pixels around a thing that it may cover in part
 SMALL = 0.3  # of the smallest thing of the recording: below it, an area is noise
+REACH = 0.25  # of the picture's width: farther off is another thing
 CHUNK = 512  # pictures at once
 
 
@@ -33,6 +34,29 @@ class Tracks:
 
 
 @dataclass(frozen=True)
+class Followed:
+    """N things of B pictures, as far as they were followed."""
+
+    place: Tensor  # [B, N, 2], pixels
+    speed: Tensor  # [B, N, 2], pixels a step
+    area: Tensor  # [B, N], pixels
+    usual: Tensor  # [B, N], the area of late
+    colour: Tensor  # [B, N], number of the colour
+    here: Tensor  # bool [B, N]
+    cut: Tensor  # bool [B, N]
+    others: Tensor  # int64 [B]
+
+    def step(self, areas: Tensor, reach: float) -> Followed:
+        """One picture on, whose areas are [B, M, 5]. reach: pixels that a thing may go beyond its speed."""
+        place, area, here, cut, others = _matched(
+            self.place + self.speed, self.usual, self.colour, self.here, areas, reach
+        )
+        speed = torch.where(here[..., None], place - self.place, self.speed)
+        usual = torch.where(here, 0.7 * self.usual + 0.3 * area, self.usual)
+        return Followed(place, speed, area, usual, self.colour, here, cut, others)
+
+
+@dataclass(frozen=True)
 class Tracker:
     """Finds and follows the things that differ from a background."""
 
@@ -43,39 +67,20 @@ class Tracker:
     def follow(self, pictures: Tensor) -> Tracks:
         """Tracks of uint8 [T + 1, B, H, W, 3]: of the things in the first picture of each rollout."""
         steps, batch = pictures.shape[:2]
-        areas = self.areas(pictures.flatten(0, 1)).unflatten(
-            0, (steps, batch)
-        )  # [T + 1, B, M, (size, x, y, colour, cut)]
-        held = areas[..., 0] > SMALL * self.smallest
-        areas = torch.where(held[..., None], areas, 0.0)
-        first = areas[0]
-        order = (~held[0]).double().mul(1e9).add(1e4 * first[..., 3] + first[..., 1]).argsort(1)
-        first = first.gather(1, order[..., None].expand_as(first))
-        count = int(held[0].sum(1).max())
-        if count == 0:
-            raise TerrellaError(
-                "the first pictures show no thing that differs from the background; is anything in view?"
-            )
-        now, size, colour, here = (
-            first[:, :count, 1:3],
-            first[:, :count, 0],
-            first[:, :count, 3],
-            first[:, :count, 0] > 0,
-        )
-        speed = torch.zeros_like(now)
-        rows = [(now, size, here, first[:, :count, 4] > 0, torch.zeros(batch, dtype=torch.long))]
-        for step in range(1, steps):
-            after = _matched(now + speed, size, colour, here, areas[step], 0.25 * pictures.shape[3])
-            speed = torch.where((after[2] & here)[..., None], after[0] - now, speed)
-            size = torch.where(after[2], 0.7 * size + 0.3 * after[1], size)
-            now, here = after[0], after[2] | (here & False)
-            rows.append(after)
-        return Tracks(*(torch.stack(part) for part in zip(*rows)))
+        areas = self.areas(pictures.flatten(0, 1)).unflatten(0, (steps, batch))
+        rows = [begin(areas[0])]
+        for row in areas[1:]:
+            rows.append(rows[-1].step(row, REACH * pictures.shape[3]))
+        every = [
+            torch.stack(part) for part in zip(*((row.place, row.area, row.here, row.cut, row.others) for row in rows))
+        ]
+        return Tracks(*every)
 
     def areas(self, pictures: Tensor) -> Tensor:
         """The largest things of each picture [F, THINGS, 5]: size in pixels, x, y, colour, whether it reaches the edge; 0 where
-        there are fewer."""
-        return torch.cat([self._areas(part) for part in pictures.split(CHUNK)])
+        there are fewer, or where they are too small."""
+        areas = torch.cat([self._areas(part) for part in pictures.split(CHUNK)])
+        return torch.where(areas[..., :1] > SMALL * self.smallest, areas, 0.0)
 
     def cover(self, values: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
         """(how much of each pixel [P, K] a thing of each colour would cover, 0 to 1; the error that leaves, of 255).
@@ -143,6 +148,19 @@ class Tracker:
         weight[both] = mixed[:, 0]
         frame, y, x = (torch.cat([part, part[both]]) for part in (frame, y, x))
         return (frame, y, x), torch.cat([label, other[both]]), torch.cat([weight, mixed[:, 1]]).double(), colour
+
+
+def begin(areas: Tensor) -> Followed:
+    """The things of first pictures, whose areas are [B, M, 5], by colour, then from left to right. TerrellaError without any."""
+    held = areas[..., 0] > 0
+    count = int(held.sum(1).max())
+    if count == 0:
+        raise TerrellaError("the first pictures show no thing that differs from the background; is anything in view?")
+    order = (~held).double().mul(1e9).add(1e4 * areas[..., 3] + areas[..., 1]).argsort(1)[:, :count]
+    size, x, y, colour, cut = areas.gather(1, order[..., None].expand(-1, -1, 5)).unbind(-1)
+    place = torch.stack([x, y], -1)
+    none = torch.zeros(len(areas), dtype=torch.long)
+    return Followed(place, torch.zeros_like(place), size, size, colour, size > 0, cut > 0, none)
 
 
 def fit_tracker(pictures: Tensor) -> Tracker:

@@ -198,8 +198,11 @@ def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], d
     if body.velocity is not None:
         velocity = _spread(_numbers(flat, body.velocity, len(system.axes)), system.axes)
     elif len(position) > 1:
+        half = (
+            0.0 if body.driven else 0.5 * dt_s * position.new_tensor(system.gravity_m_s2)
+        )  # to the end of each step, in flight
         velocity = position.diff(dim=0) / dt_s
-        velocity = torch.cat([velocity[:1], velocity])
+        velocity = torch.cat([velocity[:1] - half, velocity + half])
     else:
         velocity = torch.zeros_like(position)
     upright = position.new_tensor([1.0, 0, 0, 0]).expand(*position.shape[:2], 4)

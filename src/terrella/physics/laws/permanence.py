@@ -49,12 +49,15 @@ class Permanence:
         return replace(motion, present=motion.present & ~gone), some
 
     def correct(self, motion: Trajectory) -> Trajectory:
-        """Bodies that vanished or left the bounds are where they were; new ones go."""
-        was, lost = motion.present[-2], motion.present[-2] & ~motion.present[-1]
+        """Bodies that vanished go on as they went; those that left the bounds are where they were; new ones go."""
+        was, vanished = motion.present[-2], motion.present[-2] & ~motion.present[-1]
+        parts = {
+            name: torch.where(vanished[..., None], getattr(motion, name)[-2], getattr(motion, name)[-1])
+            for name in _PLACE
+        }
+        parts["position"] = parts["position"] + vanished[..., None] * motion.velocity[-2] * motion.dt_s
         if motion.system.bounds_m is not None:
             low, high = motion.position.new_tensor(motion.system.bounds_m)
-            lost = lost | (motion.position[-1] < low).any(-1) | (motion.position[-1] > high).any(-1)
-        parts = {
-            name: torch.where(lost[..., None], getattr(motion, name)[-2], getattr(motion, name)[-1]) for name in _PLACE
-        }
+            lost = ((parts["position"] < low) | (parts["position"] > high)).any(-1, keepdim=True)
+            parts = {name: torch.where(lost, getattr(motion, name)[-2], part) for name, part in parts.items()}
         return with_last(motion, present=was, **parts)
