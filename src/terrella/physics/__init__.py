@@ -23,4 +23,13 @@ __all__ = [
     "Tolerance",
     "Wall",
 ]
-__all__ += ["GuardConfig", "GuardReport", "Guarded", "replay_case", "calibrate", "certify", "fit_tracked", "trajectory_of"]
+__all__ += [
+    "GuardConfig",
+    "GuardReport",
+    "Guarded",
+    "replay_case",
+    "calibrate",
+    "certify",
+    "fit_tracked",
+    "trajectory_of",
+]

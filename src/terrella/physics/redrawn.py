@@ -134,8 +134,8 @@ class RedrawnWorld:
         for body in range(goal.shape[1]):
             mask = _own(at, radius, body, picture.shape[1:3])
             layer = _layer(model, background, mask, self.tracked.tracker, prior[_KEY + "colour"][:, body].long())
-            moved = _shifted(layer, goal[:, body] - at[:, body])
-            shown = drawn * (1 - moved[..., :1]) + moved[..., 1:]
+            layer = _shifted(layer, goal[:, body] - at[:, body])
+            shown = drawn * (1 - layer[..., :1]) + layer[..., 1:]
             drawn = torch.where(here[:, body, None, None, None], shown, drawn)
         return drawn.round().clamp(0, 255).to(torch.uint8)
 
