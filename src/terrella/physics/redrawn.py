@@ -96,18 +96,15 @@ class RedrawnWorld:
             before = Followed(*(prior[_KEY + name] for name in _PARTS))
             things = before.step(areas, REACH * picture.shape[2])
         missing = len(self.system.bodies) - 1 - things.area.shape[1]
-        parts = {name: getattr(things, name) for name in _PARTS}
+        parts: dict[str, Tensor] = {name: getattr(things, name) for name in _PARTS}
         if prior is None and missing > 0:  # fewer things than bodies: the others are not there
-            pad = {
-                name: (0, 0, 0, missing) if part.ndim == 3 else (0, missing)
-                for name, part in parts.items()
-                if name != "others"
-            }
-            parts = {name: F.pad(part, pad[name]) if name in pad else part for name, part in parts.items()}
+            for name in _PARTS[:-1]:
+                flat = (0, 0, 0, missing) if parts[name].ndim == 3 else (0, missing)
+                parts[name] = F.pad(parts[name], flat)
         model = dict(zip(_MODEL, (picture, parts["place"], parts["area"])))
         if dreamt and prior is not None:
             model = {name: prior[_KEY + name] for name in _MODEL}
-        held = {**parts, **model, "shown": picture}
+        held: dict[str, Tensor] = {**parts, **model, "shown": picture}
         return inner.replace(**{_KEY + name: part for name, part in held.items()})
 
     def _goal(self, observation: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
