@@ -101,11 +101,10 @@ class RedrawnWorld:
             for name in _PARTS[:-1]:
                 flat = (0, 0, 0, missing) if parts[name].ndim == 3 else (0, missing)
                 parts[name] = F.pad(parts[name], flat)
-        model = dict(zip(_MODEL, (picture, parts["place"], parts["area"])))
+        parts.update({"shown": picture, "model": picture, "model_place": parts["place"], "model_area": parts["area"]})
         if dreamt and prior is not None:
-            model = {name: prior[_KEY + name] for name in _MODEL}
-        held: dict[str, Tensor] = {**parts, **model, "shown": picture}
-        return inner.replace(**{_KEY + name: part for name, part in held.items()})
+            parts.update({name: prior[_KEY + name] for name in _MODEL})
+        return inner.replace(**{_KEY + name: part for name, part in parts.items()})
 
     def _goal(self, observation: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """(places [B, N, 2] in pixels, bool [B, N]: there) that are observed."""
