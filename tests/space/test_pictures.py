@@ -91,6 +91,19 @@ def test_posed_pictures_become_views_and_a_world(tmp_path, capsys):
     assert (tmp_path / "run" / "resume.safetensors").read_bytes() == before
 
 
+def test_few_pictures_take_lifted_depth_and_keep_enough_out_for_an_interval(tmp_path, capsys, monkeypatch):
+    folder, _ = written(tmp_path / "set", walk(9))
+    lifted = []
+    monkeypatch.setattr(
+        "terrella.learn.recipes.splat_views.with_prior", lambda views, _: lifted.append(len(views)) or views
+    )
+    fit = ["space", "fit", str(folder), "--steps", "5", "--gaussians", "500", "--out", str(tmp_path / "run"), "--json"]
+    assert main(fit) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert lifted == [9] and facts["held_out"] == 2 and facts["pictures"] == 7
+    assert np.isfinite(facts["held_out_db"]).all() and np.isfinite(facts["nearest_picture_db"]).all()
+
+
 def test_a_bent_lens_is_straightened(tmp_path):
     folder, doc = written(tmp_path / "set", k1=-0.2, k2=0.03)
     shots, _ = posed_pictures(folder, tmp_path / "work", 100)

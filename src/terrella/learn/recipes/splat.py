@@ -15,6 +15,7 @@ from ...core.errors import ContractError, TrainingError
 from ...space.files import replace_whole
 from ...space.fitting import Fit, PosedViews, decibels, nearest_views, psnr
 from ...space.occupancy import Occupancy, Walker
+from ...space.pictures.posed import FEWEST
 from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
 from ...worlds.checkpoint import WORLD_FILE
@@ -29,7 +30,7 @@ LOOK_S, LOOK_SHARE, LOOKED_AT = (
     20,
     4,
 )  # seconds between previews, which take at most 1/20 of the time; their test pictures
-HELD_OUT = 8  # every 8th picture is held out to measure the fit
+HELD_OUT, OF_FEW = (8, 4), 16  # every 8th picture is held out to measure the fit; of fewer than 16 every 4th
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
 
@@ -48,7 +49,8 @@ def fit_splat(
     name = config.name or Path(data).stem or Path(data).resolve().stem
     config = replace(config, name=config.name or "place")  # as in the recipes of earlier runs
     views, spec, left_out = read_views(data, out, config)
-    held = torch.arange(len(views)) % HELD_OUT == HELD_OUT // 2
+    every = HELD_OUT[len(views) < OF_FEW]
+    held = torch.arange(len(views)) % every == every // 2
     seen, tested = views.at(~held), views.at(held)
     try:
         fit = Fit(seen, config.fit)
@@ -88,8 +90,8 @@ def fit_splat(
 
 
 def _check(config: SplatFit) -> None:
-    if config.frames < 16 or (config.episodes is not None and config.episodes < 1):
-        raise TrainingError("--frames is 16 or more, --episodes 1 or more.")
+    if config.frames < FEWEST or (config.episodes is not None and config.episodes < 1):
+        raise TrainingError(f"--frames is {FEWEST} or more, --episodes 1 or more.")
     if not 1e-4 <= config.scale <= 1e4 or not 32 <= config.longest <= 4096:
         raise TrainingError("--scale is from 0.0001 to 10,000, --longest from 32 to 4096.")
 

@@ -112,8 +112,8 @@ def _recorded(data: str | Path, config: SplatFit) -> tuple[PosedViews, Mapping[s
     poses = [dataset.episode(number, ["pose"])["pose"] for number in episodes]
     inside = [np.flatnonzero(_within(pose * config.scale, config.box)) for pose in poses]
     total = sum(map(len, inside))
-    if total < 16:
-        raise DatasetError(f"{data} has {total} pictures there, and a fit needs 16 or more; ask for more of it.")
+    if total < FEWEST:
+        raise DatasetError(f"{data} has {total} pictures there, and a fit needs {FEWEST} or more; ask for more of it.")
     chosen = np.linspace(0, total - 1, min(config.frames, total)).round().astype(int)
     first = 0
     for number, rows in zip(episodes, inside):
