@@ -3,6 +3,7 @@
     python lab/babyai.py demonstrate OUT.npz GoToObj:800 GoToLocal:3000 PickupLoc:2500
     python lab/babyai.py train OUT.npz RUN 50            # minutes; several files with commas between
     python lab/babyai.py judge RUN GoToObj GoToLocal PickupLoc --missions 512
+    python lab/babyai.py play MINE.npz RUN PutNextLocal:500  # the policy's own episodes, for the ends of skills
     python lab/babyai.py skills OUT.npz RUN LIBRARY      # a library of skills
     python lab/babyai.py compose LIBRARY GoTo Synth --missions 300   # three steps by skills and by the flat policy
 
@@ -75,6 +76,40 @@ def demonstrate(out: str, levels: list[str]) -> None:
             ranges.append((first, len(rows["valid"])))
         print(name, len(ranges), "episodes", len(rows["valid"]), "rows", len(tasks), "tasks", flush=True)
     np.savez_compressed(out, ranges=ranges, tasks=list(tasks), **{key: np.array(value) for key, value in rows.items()})
+
+
+@torch.no_grad()
+def play(out: str, run: str, levels: list[str]) -> None:
+    """Arrays of a policy's own episodes: what it does wrong is no end, by the game's reward."""
+    rows = {name: [] for name in ("image", "direction", "action", "advice", "valid", "task", "reward")}
+    tasks, ranges, rng = {}, [], make_rng(0)
+    policy = ImitationActor.load(run, GymnasiumWorld("BabyAI-GoToLocal-v0", rgb=False).spec)
+    for level in levels:
+        name, _, count = level.partition(":")
+        env = gymnasium.make(f"BabyAI-{name}-v0").unwrapped
+        for seed in range(int(count)):
+            seen, _ = env.reset(seed=3 * 10**6 + seed)
+            first, memory, over = len(rows["valid"]), policy.begin(1, rng), False
+            task = tasks.setdefault(seen["mission"], len(tasks))
+            for _ in range(MOST_STEPS):
+                action, memory = policy.act(_shown([seen], [seen["mission"]]), memory, rng)
+                _add(rows, seen, task, True)
+                seen, reward, ended, cut, _ = env.step(int(action[0]))
+                _add_action(rows, int(action[0]), int(action[0]), reward)
+                if over := ended or cut:
+                    break
+            _add(rows, seen, task, not over)
+            _add_action(rows, 0, 0, 0.0)
+            ranges.append((first, len(rows["valid"])))
+    np.savez_compressed(out, ranges=ranges, tasks=list(tasks), **{key: np.array(value) for key, value in rows.items()})
+
+
+def _shown(seen: list, texts: list[str]) -> dict[str, torch.Tensor]:
+    return {
+        "image": torch.from_numpy(np.stack([one["image"] for one in seen])),
+        "direction": torch.tensor([int(one["direction"]) for one in seen]),
+        "text": torch.from_numpy(np.stack([text_to_bytes(text) for text in texts])),
+    }
 
 
 def _out_of_time(*_) -> None:
@@ -260,11 +295,7 @@ def played(make: Callable, policy, missions: int, words: dict[str, str] | None =
         texts = [seen[number]["mission"] for number in going]
         for old, new in (words or {}).items():
             texts = [text.replace(old, new) for text in texts]
-        shown = {
-            "image": torch.from_numpy(np.stack([seen[number]["image"] for number in going])),
-            "direction": torch.tensor([int(seen[number]["direction"]) for number in going]),
-            "text": torch.from_numpy(np.stack([text_to_bytes(text) for text in texts])),
-        }
+        shown = _shown([seen[number] for number in going], texts)
         action, memory = policy.act(shown, memory, rng)
         kept = []
         for place, number in enumerate(going):
@@ -288,6 +319,8 @@ if __name__ == "__main__":
         demonstrate(target, rest)
     elif what == "train":
         train(target, rest[0], float(rest[1]), *map(int, rest[2:4]), *rest[4:])
+    elif what == "play":
+        play(target, rest[0], rest[1:])
     elif what == "skills":
         skills(target, *rest)
     else:

@@ -38,7 +38,8 @@ def plan(world: WorldName, config: PlanConfig, json: Json = False) -> int:
         world: The world to plan in: a name of `terrella list`, the path of a checkpoint, or a simulator (gym:CartPole-v1).
     """
     outcome = run_plan(world, config, progress=say)
-    following = command("terrella", "evaluate", "plan", real=config.real, **{"in": world})
+    policy = "plan" if config.skills is None else str(config.skills)
+    following = command("terrella", "evaluate", policy, real=config.real, **{"in": world})
     show(outcome, json, following)
     return STOPPED if outcome.stopped else 0
 

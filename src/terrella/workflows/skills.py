@@ -111,6 +111,7 @@ class SkillEpisode:
     finished: bool  # all instructions are done, by the library's own judgement
     reward: float
     steps: int
+    ended: bool = False  # by the environment, before all were done
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,8 @@ class SkillPlanResult:
     def summary(self) -> str:
         lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
         lines += [] if self.goal else [f"The environment rewarded {self.rewarded}."]
+        if ended := sum(one.ended for one in self.episodes):
+            lines.append(f"The environment ended {ended} of {len(self.episodes)} before, by rules of its own.")
         for number, one in enumerate(self.episodes[:3], 1):
             lines += [f"episode {number}, {one.steps} steps:", *(f"    {event}" for event in one.events)]
         return "\n".join(lines)
@@ -251,5 +254,5 @@ def _episode(world: World, state: Any, actor: SkillActor, steps: int, rng: torch
         reward += float(seen["reward"]) if "reward" in seen else 0.0
         if "done" in seen and bool(seen["done"]):
             _, memory = act(actor, seen, memory, 1, world.spec, rng)
-            return SkillEpisode(memory[0].events, memory[0].finished, reward, step + 1)
+            return SkillEpisode(memory[0].events, memory[0].finished, reward, step + 1, not memory[0].finished)
     return SkillEpisode(memory[0].events, False, reward, steps)
