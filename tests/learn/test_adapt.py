@@ -23,7 +23,7 @@ from terrella.learn.rehearsal import joined
 
 from ..data.layouts import layout_of
 
-SHORT = AdaptConfig(steps=120, batch=32, learning_rate=1e-3)
+SHORT = AdaptConfig(steps=80, batch=24, learning_rate=1e-3)
 
 
 def heavier(folder, width=2, episodes=6, length=60):
@@ -50,7 +50,7 @@ def made(tmp_path_factory):
     """A world, the recording that it learned, and one of another body."""
     folder = tmp_path_factory.mktemp("adapt")
     old, new = drifting(folder / "old"), heavier(folder / "new")
-    train_latent(old, folder / "run", replace(QUICK, latent=None, steps=250), quiet)
+    train_latent(old, folder / "run", replace(QUICK, latent=None, steps=160), quiet)
     return terrella.load(folder / "run"), old, new
 
 
