@@ -33,10 +33,10 @@ LIMITS = {
 }
 
 
-def drifting(folder, pictures=None, acted=True, vectors=True, episodes=6, length=60):
+def drifting(folder, pictures=None, acted=True, vectors=True, episodes=6, length=60, still=False):
     """A mass that a force pushes to and fro; a picture is a bar where it is. It ends at the right wall, which pays."""
     rng = np.random.default_rng(0)
-    told = {"state": 2} if vectors else {}
+    told = ({"state": 2} if vectors else {}) | ({"contact": 1} if still else {})
     layout = layout_of(10.0, ("force",), rgb=pictures, vectors=told, world={"name": "drift", **LIMITS})
     layout = type(layout)(**{**vars(layout), "pictures": "png"})
     with Recorder(folder, layout) as recorder:
@@ -46,6 +46,8 @@ def drifting(folder, pictures=None, acted=True, vectors=True, episodes=6, length
             for row in range(length):
                 force = rng.uniform(-1, 1) if row % 4 == 0 else force
                 seen = {"state": np.array([at, speed], np.float32)} if vectors else {}
+                if still:
+                    seen["contact"] = np.zeros(1, np.float32)
                 if pictures:
                     seen["rgb"] = picture(at, *pictures)
                 last = row == length - 1
@@ -111,6 +113,14 @@ def test_the_world_of_the_run_is_opened_by_name_and_keeps_the_contract(run):
 
 
 @pytest.mark.slow
+def test_a_number_that_never_changes_does_not_spoil_the_verdict(tmp_path):
+    data = drifting(tmp_path / "data", still=True)
+    facts = train_latent(data, tmp_path / "run", replace(QUICK, latent=None), quiet)
+    errors = facts["errors"]["latent"]
+    assert facts["latent"] == 3 and errors["true actions"]["8"] < 0.6 * errors["copy-last"]["8"]
+    assert facts["verdict"].startswith("Better than copy-last after 16 steps")
+
+
 def test_a_few_numbers_are_the_latent_themselves(vectors, tmp_path):
     """No encoder, no collapse to prevent: what is decoded is what was predicted."""
     facts = train_latent(vectors, tmp_path, replace(QUICK, latent=None), quiet)

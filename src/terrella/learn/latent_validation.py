@@ -23,6 +23,7 @@ CLIPS = 256  # over which open-loop errors are averaged
 CLEARLY = 0.9  # share of another error below which an error is clearly less
 HELD = 0.5  # R² of a linear probe from which latents hold a vector
 PROBED = 4096  # rows to which linear probes are fitted
+CONSTANT = 1e-3  # the deviation below which a number of the latent is constant: its error says nothing
 ARMS = ("true actions", "another's actions", "copy-last")
 
 
@@ -93,7 +94,9 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
     rng = np.random.default_rng(0)
     rows = np.sort(rng.choice(rows, min(len(rows), clips), replace=False))
     others = np.roll(rng.permutation(rows), 1)
-    unit = encode_rows(world, recording, _some(recording, PROBED)).std(0, correction=0).clamp_min(1e-6)
+    deviation = encode_rows(world, recording, _some(recording, PROBED)).std(0, correction=0)
+    varies = (deviation > CONSTANT) | (deviation <= CONSTANT).all()
+    unit = deviation[varies].clamp_min(CONSTANT)
     latent, vectors, spread = {}, {}, {}
     began = {name: _vector(recording, name, rows) for name, _ in world.network.config.vectors}
     first, rewards = encode_rows(world, recording, rows), _rewards(recording)
@@ -104,8 +107,8 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
             if step not in fitting:
                 continue
             truth = encode_rows(world, recording, rows + step)
-            latent[arm, step] = _per_clip((state["window"][:, -1] - truth) / unit)
-            latent[ARMS[2], step] = _per_clip((first - truth) / unit)
+            latent[arm, step] = _per_clip((state["window"][:, -1] - truth)[:, varies] / unit)
+            latent[ARMS[2], step] = _per_clip((first - truth)[:, varies] / unit)
             spread.setdefault(step, state["spread"])
             if rewards is not None:
                 reward, scale = rewards
