@@ -26,12 +26,10 @@ from ..data.layouts import layout_of
 SHORT = AdaptConfig(steps=80, batch=24, learning_rate=1e-3)
 
 
-def heavier(folder, width=2, episodes=6, length=60):
+def heavier(folder, width=2, episodes=6, length=60, fps=10.0):
     """A heavier mass with less drag."""
-    rng, layout = (
-        np.random.default_rng(1),
-        layout_of(10.0, ("force",), vectors={"state": width}, world={"name": "m", **LIMITS}),
-    )
+    rng, facts = np.random.default_rng(1), {"name": "m", **LIMITS, "dt_s": 1 / fps}
+    layout = layout_of(fps, ("force",), vectors={"state": width}, world=facts)
     with Recorder(folder, layout) as recorder:
         for _ in range(episodes):
             at, speed, force = rng.uniform(-0.8, 0.8), 0.0, 0.0
@@ -75,6 +73,12 @@ def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
         adapt(world, new, tmp_path / "run", AdaptConfig(minutes=0), quiet)
     with pytest.raises(DatasetError, match=r"state of 2; .* state of 3"):
         adapt(world, heavier(tmp_path / "wide", width=3), tmp_path / "run", SHORT, quiet)
+    with pytest.raises(DatasetError, match="20 steps a second, and latent 10"):
+        adapt(world, heavier(tmp_path / "fast", fps=20.0), tmp_path / "run", SHORT, quiet)
+    alone = heavier(tmp_path / "alone", episodes=1, length=100)
+    for data, keep in ((alone, None), (new, alone)):
+        with pytest.raises(DatasetError, match="alone has one episode"):
+            adapt(world, data, tmp_path / "run", SHORT, quiet, keep)
     with pytest.raises(DatasetError, match="longer"):
         adapt(world, heavier(tmp_path / "short", episodes=30, length=5), tmp_path / "run", SHORT, quiet)
     adapt(world, new, tmp_path / "run", replace(SHORT, steps=2), quiet)

@@ -79,6 +79,11 @@ def _fitting(world: LatentWorld, data: str | Path, report: Report) -> Recording:
             f"{data} has other actions than {world.spec.name}, which takes {controls.numbers} {controls.kind}; record a body with "
             "as many."
         )
+    fps, own = recording.cache.fps, 1 / world.spec.dt_s
+    if abs(fps / own - 1) > 0.01:
+        raise DatasetError(f"{data} has {fps:g} steps a second, and {world.spec.name} {own:g}; record it at that rate.")
+    if not recording.held_out:
+        raise DatasetError(f"{data} has one episode, and none to measure on is left; record two or more.")
     return recording
 
 
