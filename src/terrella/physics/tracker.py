@@ -167,7 +167,7 @@ def fit_tracker(pictures: Tensor) -> Tracker:
     """A tracker of what moves in uint8 [F, H, W, 3], pictures of many moments from one camera that stands still. TerrellaError
     where nothing moves, or all does."""
     some = pictures[torch.linspace(0, len(pictures) - 1, min(len(pictures), 256)).long()].float()
-    background = some.median(0).values
+    background = _floored(some, some.median(0).values)
     differs = (some - background).abs().amax(-1)
     moving = float((differs > DIFFERENCE).float().mean())
     if moving > 0.5:
@@ -194,6 +194,15 @@ def fit_tracker(pictures: Tensor) -> Tracker:
     return Tracker(background, tracker.colours, float(sizes.quantile(0.1)) if len(sizes) else 1.0)
 
 
+def _floored(some: Tensor, background: Tensor) -> Tensor:
+    """The background, with its commonest colour wherever that is seen now and then: what mostly lies there is a thing."""
+    flat = background.flatten(0, 1)
+    bins = (flat / 32).long() @ torch.tensor([64, 8, 1])
+    floor = flat[bins == bins.mode().values].median(0).values
+    seen = ((some - floor).abs().amax(-1) < DIFFERENCE / 2).float().mean(0) > SHARE
+    return torch.where(seen[..., None], floor, background)
+
+
 def _matched(
     goal: Tensor, size: Tensor, colour: Tensor, here: Tensor, areas: Tensor, reach: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -215,6 +224,9 @@ def _matched(
             size[rows, thing][:, None],
         )
         room[rows[some], area[some]] -= taken[rows, area][some]
+    radius = (areas[..., 0] / torch.pi).sqrt()[:, None] + 0.5
+    inside, over = torch.where(cost < radius.clamp_max(0.5 * reach), apart, torch.inf).min(2)
+    pick = torch.where((pick < 0) & here & inside.isfinite(), over, pick)  # behind another one of its colour
     present = pick >= 0
     mine = areas.gather(1, pick.clamp_min(0)[..., None].expand(-1, -1, 5))
     shared = (pick[:, :, None] == pick[:, None, :]) & present[:, :, None] & present[:, None, :]
