@@ -41,13 +41,15 @@ INTRUDING, FREE_M = 0.05, 0.1
 ROOMS = {
     "living room": "a bright scandinavian living room at noon",
     "library": "a cosy library with a red door",
+    "empty library": "a library with a red door",
     "dungeon": "a dungeon with torches",
 }
+MEASURED = {"panorama": ("living room", "empty library", "dungeon"), "grow": ("living room", "library", "dungeon")}
 
 
-def built(text: str) -> BuiltPlace:
+def built(text: str, gaussians: int = 200_000) -> BuiltPlace:
     """A room that the lifter's training never saw: its words have a seed of their own."""
-    return build(parse_text(text, SEED).layout, 200_000)
+    return build(parse_text(text, SEED).layout, gaussians)
 
 
 def to_bytes(rgb: torch.Tensor) -> torch.Tensor:
@@ -58,7 +60,7 @@ def to_bytes(rgb: torch.Tensor) -> torch.Tensor:
 @torch.no_grad()
 def panorama(name: str, text: str, out: Path | None, height: int = 512) -> None:
     """Figures of one room."""
-    place = built(text)
+    place = built(text, 400_000)
     pose = torch.tensor([[*place.starts[0, :2].tolist(), float(place.starts[0, 2]) + EYE_M, 1, 0, 0, 0]])
     seen = rasterise(place.gaussians, pose, None, (height, 2 * height))
     truth, picture = (seen.depth / seen.alpha.clamp_min(0.01))[0], to_bytes(seen.rgb[0]).numpy()
@@ -150,7 +152,7 @@ def main() -> None:
     given = parser.parse_args()
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
-    for name in [given.room] if given.room else ROOMS:
+    for name in [given.room] if given.room else MEASURED[given.what]:
         if given.what == "panorama":
             panorama(name, ROOMS[name], given.out)
         else:
