@@ -24,7 +24,7 @@ help:
 	@echo "make clean   remove .venv and caches"
 
 play: $(VENV)/.ready-play
-	$(BIN)/terrella play doom-maze $(ARGS)
+	$(BIN)/terrella play $(ARGS)
 
 # Two at a time, file by file; all files that drive a browser are one group (tests/conftest.py).
 PYTEST = $(BIN)/python -m pytest
