@@ -9,7 +9,7 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 
 .PHONY: help play test test-all test-portable test-lerobot test-splats judge judge-cube check format bench bench-gpu clean
 help:
-	@echo "make play    step inside the bundled world: prints the address of a page that answers W A S D"
+	@echo "make play    open a page of worlds and places to step into: prints its address"
 	@echo "make test    run the tests, in a real browser too"
 	@echo "make test-all  the same with the slow sweeps (damaged files, many seeds)"
 	@echo "make test-portable  run the numeric tests as a plain processor would: no wide vectors, one thread"
