@@ -86,7 +86,7 @@ def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
         adapt(world, new, tmp_path / "run", SHORT, quiet)
 
 
-def test_laws_are_a_part_of_the_loss_where_the_recording_describes_its_bodies(made, tmp_path):
+def test_laws_are_a_part_of_the_loss_where_the_recording_describes_its_bodies(made, tmp_path, monkeypatch):
     config = terrella.CollectConfig(tmp_path / "balls", frames=400, pictures="none")
     terrella.collect("physics:parabola", config)
     few = LatentTraining(steps=2, batch=8, rollout=4, leap=0, strip_every_s=1e9)
@@ -104,7 +104,11 @@ def test_laws_are_a_part_of_the_loss_where_the_recording_describes_its_bodies(ma
     loss = laws(broken)
     loss.backward()
     assert loss > 0.1 and broken.grad is not None and broken.grad.isfinite().all() and broken.grad.abs().sum() > 0
+    seen = []
+    monkeypatch.setattr(LawLoss, "__call__", lambda laws, numbers: seen.append(len(numbers)) or 0 * numbers.sum() + 1)
     adapt(world, tmp_path / "balls", tmp_path / "adapted", AdaptConfig(steps=2, batch=8), quiet)
+    adapt(world, tmp_path / "balls", tmp_path / "kept", AdaptConfig(steps=2, batch=8), quiet, tmp_path / "balls")
+    assert seen == [8, 8, 4, 4]  # not on the half that is kept
     assert json.loads((tmp_path / "adapted" / "log.jsonl").read_text().splitlines()[-1])["laws"] > 0
 
 

@@ -267,7 +267,6 @@ class _Training:
         names = [name for name in ("action", "reward", "done") if all(getattr(one, name) is not None for one in caches)]
         names += [name for name, _ in self.network.config.vectors] + (["rgb"] if self.network.config.size else [])
         laws = LawLoss.of(recording, self.network, steps) if self.begin and self.begin.laws else None
-        objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps, laws)
         total = config.steps or (2500 if self.sees_pictures else 4000)
 
         def stream(source: Recording, size: int) -> Feed:
@@ -280,7 +279,14 @@ class _Training:
         def feed(size: int) -> Feed:
             return Rehearsal(stream(recording, size // 2), stream(kept, size // 2)) if kept else stream(recording, size)
 
-        trainer = Trainer(self.run, STAGE, SizedFeed(feed, batch, min(4 if kept else 2, batch)), objective, total)
+        sized = SizedFeed(feed, batch, min(4 if kept else 2, batch))
+
+        def broken(numbers: torch.Tensor) -> torch.Tensor:  # the kept recording may be of another body
+            assert laws is not None
+            return laws(numbers[: min(sized.size // 2, clips_in(recording))] if kept else numbers)
+
+        objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps, laws and broken)
+        trainer = Trainer(self.run, STAGE, sized, objective, total)
         done = (self.run.out / "world" / WORLD_FILE).exists() and "validation" in trainer.facts
         if not trainer.finished:
             trainer.facts.pop("validation", None)
