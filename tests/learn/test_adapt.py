@@ -79,6 +79,9 @@ def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
     for data, keep in ((alone, None), (new, alone)):
         with pytest.raises(DatasetError, match="alone has one episode"):
             adapt(world, data, tmp_path / "run", SHORT, quiet, keep)
+    brief = heavier(tmp_path / "brief", episodes=30, length=8)
+    with pytest.raises(DatasetError, match=r"no episode of .*brief that is trained on has 15 rows; record longer ones"):
+        adapt(world, new, tmp_path / "run", SHORT, quiet, brief)
     with pytest.raises(DatasetError, match="longer"):
         adapt(world, heavier(tmp_path / "short", episodes=30, length=5), tmp_path / "run", SHORT, quiet)
     adapt(world, new, tmp_path / "run", replace(SHORT, steps=2), quiet)

@@ -12,7 +12,7 @@ from tests.learn.stopping import quiet
 
 from terrella.core.errors import TrainingError
 from terrella.learn.devices import Compiled
-from terrella.learn.presets import GIB, PRESETS, TrainingPlan
+from terrella.learn.presets import GIB, PRESETS, STEPS, TrainingPlan
 from terrella.learn.recipes.video import train_video
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world
@@ -63,14 +63,17 @@ def test_a_run_that_was_begun_keeps_its_size():
     assert plan(minutes=600).kept(None).preset.name == "huge"
 
 
-def test_a_world_is_trained_by_its_preset_which_is_said(corridor, tmp_path):
+def test_a_world_is_trained_by_its_preset_which_is_said(corridor, tmp_path, monkeypatch):
     lines: list[str] = []
-    config = replace(FLAT, channels=(), steps=2, batch=1, uncertainty_frames=0, outcome_steps=1)
-    train_video(corridor, tmp_path, config, quiet, say=lines.append)
+    config = replace(FLAT, channels=(), steps=None, batch=1, uncertainty_frames=0, outcome_steps=1)
+    monkeypatch.setitem(STEPS, "cpu", 2)
+    facts = train_video(corridor, tmp_path, config, quiet, say=lines.append)
     assert len(lines) == 1 and "the preset small, 2.4M parameters (--preset), batches of 1 (--batch)" in lines[0]
     assert load_world(tmp_path / "world").generator.config.channels == (64, 112, 160)
     with pytest.raises(TrainingError, match="preset auto, not large"):
         train_video(corridor, tmp_path, replace(config, preset="large"), quiet)
+    monkeypatch.setitem(STEPS, "cpu", 3)  # as on a device with other defaults: the run keeps its steps
+    assert train_video(corridor, tmp_path, config, quiet)["step"] == facts["step"]
 
 
 def test_without_a_compiler_it_computes_as_it_is_and_says_so(monkeypatch):

@@ -146,6 +146,12 @@ def test_a_skill_is_renamed_tried_and_listed(library, capsys):
     assert "'walk' works in" in capsys.readouterr().out
     assert main(["skills", "list", folder]) == 0
     assert "walk" in capsys.readouterr().out
+    for words, said in (
+        (["list", str(library[1])], "holds no skills; make a library"),
+        (["try", folder, "walk", "--in", NAME, "--episodes", "0"], "--episodes is 1 or more"),
+    ):
+        assert main(["skills", *words]) == 2
+        assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -154,6 +160,7 @@ def test_a_skill_is_renamed_tried_and_listed(library, capsys):
         (["--goal", "go to the crimson ball"], "do not know 'crimson'"),
         (["--goal", "go"], "no skill does 'go'"),
         (["--rollouts", "-1"], "--rollouts is 0 or more"),
+        (["--episodes", "0"], "--episodes and --steps are whole numbers from 1 up"),
         (["--goal", "go to the red ball", "--proposal", "x"], "--proposal: plans of skills have no use"),
     ],
 )

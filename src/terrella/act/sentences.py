@@ -54,7 +54,8 @@ class WordEncoder(nn.Module):
 
     def forward(self, words: torch.Tensor) -> torch.Tensor:
         """[N, width]"""
-        words = words[:, : max(1, int((words != 0).any(0).sum()))]  # beyond, there are none
+        last = (words != 0).any(0).nonzero()[-1:].sum()  # 0 where no word is known
+        words = words[:, : int(last) + 1]
         if self.training:
             words = torch.where(torch.rand(words.shape, device=words.device) < DROPPED, 0, words)
         embedded = self.embed(words)

@@ -26,7 +26,7 @@ def bytes_of(recording: Recording, stitched: StitchedEpisodes | None) -> int:
 
 class DeviceClips:
     """Batches of clips of slots + rollout rows, preferring those that change more, as FlowClipMaker does; a clip is drawn
-    with replacement. Without a wait for the device. over: bool [H, W], what does not scroll."""
+    with replacement. Without a wait for the device."""
 
     def __init__(
         self,
@@ -79,7 +79,8 @@ class DeviceClips:
 
 
 class DeviceGrounds:
-    """What the episodes of a recording scrolled over, in one tensor on a device, and what it knows of pictures. over: as above."""
+    """What the episodes of a recording scrolled over, in one tensor on a device, and what it knows of pictures. over: bool [H, W],
+    what does not scroll."""
 
     def __init__(self, stitched: StitchedEpisodes, over: torch.Tensor, device: torch.device):
         numbers, grounds = list(stitched.grounds), list(stitched.grounds.values())

@@ -59,7 +59,6 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
     if config.panorama and config.fov is not None:
         raise TerrellaError("--fov is for pictures of one direction, --panorama for those of all; leave one out.")
     rgb = read_picture(picture, longest=2 * config.longest)
-    height, width = rgb.shape[:2]
     if config.panorama or config.fov is None and wraps(rgb):
         notes += (
             []

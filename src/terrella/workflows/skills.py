@@ -169,20 +169,24 @@ def rename_skill(library: str | Path, name: str, new: str) -> LibraryResult:
 
 def try_skill(folder: str | Path, name: str, config: TrySkillConfig, *, progress: Progress = silent) -> TriesResult:
     """Tries a skill in an environment that gives its instructions and rewards, and counts the tries in the library."""
-    library, world = SkillLibrary.load(folder), config.environment.open(config.inside)
-    episodes, seed = config.episodes, config.seed
+    if (episodes := config.episodes) < 1:
+        raise TerrellaError("--episodes is 1 or more.")
+    library, seed = SkillLibrary.load(folder), config.seed
+    world = config.environment.open(config.inside)
     skill, actor = library.named(name), SkillActor(library, world.spec)
-    world.spec.check_channels(("reward", "done"))
+    world.spec.check_channels(("text", "reward", "done"))
     won, right, rng, tried = 0, 0, make_rng(seed), 0
     with stage("trying", progress) as report:
         for start in range(MOST_STARTS * episodes):
             state = world.start(1, make_rng(seed + start))
             text = bytes_to_text(world.render(state, ("text",))["text"][0].numpy())
-            if tried == episodes or library.skill_of(text) != skill:
+            if library.skill_of(text) != skill:
                 continue
             one = _episode(world, state, actor, world.spec.max_episode_steps or STEPS, rng)
             won, right, tried = won + (one.reward > 0), right + ((one.reward > 0) == one.finished), tried + 1
             report(tried, episodes)
+            if tried == episodes:
+                break
     if not tried:
         raise TerrellaError(f"{world.spec.name} gave no instruction of '{name}' in {MOST_STARTS * episodes} starts.")
     library.tried(name, tried, won).write_names(folder)
@@ -195,6 +199,8 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     used = {"goal", "skills", "rollouts", "real", "episodes", "steps", "seed", *vars(config.environment), "device"}
     if useless := [key for key in changed_settings(config) if key.replace("-", "_") not in used]:
         raise TerrellaError(f"--{useless[0].replace('_', '-')}: plans of skills have no use for that.")
+    if config.episodes < 1 or (config.steps is not None and config.steps < 1):
+        raise TerrellaError("--episodes and --steps are whole numbers from 1 up.")
     assert config.skills is not None
     library, goal = SkillLibrary.load(config.skills), None if config.goal == REWARD else config.goal
     inside, world = _worlds(name, config, progress)

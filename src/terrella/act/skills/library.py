@@ -123,7 +123,7 @@ class SkillLibrary:
     def load(folder: str | Path) -> SkillLibrary:
         """The library of a folder; CheckpointError if it is missing, foreign or damaged."""
         folder = Path(folder)
-        if read_policy(folder).get("kind") != KIND:
+        if not (folder / POLICY_FILE).is_file() or read_policy(folder).get("kind") != KIND:
             raise CheckpointError(f"{folder} holds no skills; make a library of them with: terrella skills learn.")
         network, _ = load_imitation_network(folder / FAST_FOLDER)
         assert network.words is not None

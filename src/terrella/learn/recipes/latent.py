@@ -272,12 +272,17 @@ class _Training:
         def stream(source: Recording, size: int) -> Feed:
             least, controls = min(size, clips_in(source)), source.controls
             assert controls is not None  # see WHY
+            if not least:
+                raise DatasetError(
+                    f"no episode of {source.name} that is trained on has {config.history + steps} rows; record longer ones."
+                )
             settings = ClipsConfig(config.history + steps, names, least, seed=config.seed, episodes=source.seen)
             make = lambda rows, now: latent_clips(rows, controls, self.network.config, now.device)  # noqa: E731
             return ClipStream(Clips(source.cache, settings), make)
 
         def feed(size: int) -> Feed:
-            return Rehearsal(stream(recording, size // 2), stream(kept, size // 2)) if kept else stream(recording, size)
+            half = max(1, size // 2)
+            return Rehearsal(stream(recording, half), stream(kept, half)) if kept else stream(recording, size)
 
         sized = SizedFeed(feed, batch, min(4 if kept else 2, batch))
 

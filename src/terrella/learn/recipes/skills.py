@@ -129,7 +129,7 @@ def learn_skills(
     trainer.train(lambda: None)
     card = {"what": f"Skills of {recording.name}", "learned_from": recording.name}
     bare = SkillLibrary((), network, predictor.eval(), {}, (), 0.0, card)
-    tested = EndTest.of(bare, test if len(test.picked) else train)
+    tested = EndTest.of(bare, test if segments.success[test.picked].any() else train)
     library, without = _library(bare, tested, phrases, train)
     library.write(out)
     return library, {**trainer.summary, **tested.facts(), "without_effect": without}
@@ -160,18 +160,6 @@ def _library(
 def _numbers(tasks: Sequence[str], texts: Sequence[str]) -> np.ndarray:
     """The numbers of the tasks with these texts."""
     return np.array([number for number, task in enumerate(tasks) if task in texts])
-
-
-def _unique(skills: tuple[Skill, ...]) -> tuple[Skill, ...]:
-    """With a number behind names that are taken."""
-    names: Counter[str] = Counter()
-    for skill in skills:
-        names[skill.name] += 1
-        skills = tuple(
-            replace(one, name=f"{one.name} {names[one.name]}") if one is skill and names[one.name] > 1 else one
-            for one in skills
-        )
-    return skills
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from ..devices import describe_device, device_named, free_bytes
 from ..objectives.uncertainty import discard_uncertainty, uncertainty_seconds
 from ..presets import STEPS, TrainingPlan
 from ..recording import Recording, joined_cameras
+from ..run_folder import load_run, resume_file
 from ..sized_feed import SizedFeed
 from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer
@@ -88,7 +89,9 @@ def _recipe(
     if config.size and any(length < 16 or length % 8 for length in config.size):
         raise TrainingError(f"--size {config.size[0]} {config.size[1]}: give multiples of 8, 16 or more.")
     device = device_named(config.device)
-    config = replace(config, steps=config.steps or STEPS["cuda" if device.type == "cuda" else "cpu"])
+    begun = (load_run(resume_file(Path(out), "flow"), {}, {}) or {}).get("recipe", {})  # maybe on another device
+    usual = STEPS["cuda" if device.type == "cuda" else "cpu"]
+    config = replace(config, steps=config.steps or begun.get("steps") or usual)
     dataset = Dataset(data)
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
     run = Run.of(out, config, report, device, ("hours", "learning_rate", "compile", "half"), **facts)

@@ -142,7 +142,7 @@ def _of_panorama(distance: torch.Tensor, rgb: torch.Tensor, some: torch.Tensor, 
 
 
 def wraps(picture: np.ndarray) -> bool:
-    """Whether a picture uint8 [H, W, 3] of 2 to 1 looks like a panorama: its edges meet, and its poles are each one colour."""
+    """Whether a picture uint8 [H, W, 3] of 2 to 1 looks like a panorama: its left and right edges meet, and its halves differ."""
     shown = picture.astype(np.float32)
     if abs(shown.shape[1] / shown.shape[0] - 2) > 0.01:
         return False
