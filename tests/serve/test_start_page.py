@@ -37,7 +37,8 @@ class Drawer:
 
     def __init__(self):
         self.built: list[str] = []
-        self.marks = Path(tempfile.mkdtemp()) / "marks.json"
+        self.folder = tempfile.TemporaryDirectory()
+        self.marks = Path(self.folder.name) / "marks.json"
 
     def cards(self):
         return [
