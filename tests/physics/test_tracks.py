@@ -131,7 +131,7 @@ def test_check_judges_pictures(tmp_path):
     config = CheckConfig(tmp_path / "rec", pictures=True, out=tmp_path, steps=16, rollouts=8, fresh=True)
     result = check("physics:bouncing", config)
     assert result.report.coarse_horizon.value == 16
-    assert "Judged by pictures: ball 1 tracked, 0.0375 m a pixel" in result.summary()
+    assert "Judged by pictures: ball 1 tracked, 0.0375 m a pixel (fitted to recorded positions)" in result.summary()
     assert "The truth above, the world below" in (tmp_path / "check.html").read_text()
     with pytest.raises(TerrellaError, match="--metres-per-pixel is above 0"):
         check("physics:bouncing", CheckConfig(tmp_path / "rec", metres_per_pixel=0.0))

@@ -109,7 +109,7 @@ def fit_tracked(
     if system is not None and positions is not None:
         scale, falls = fit_scale(tracks, positions.double()), False
     elif metres_per_pixel is not None:
-        scale, falls = _upright(metres_per_pixel, height, f"{metres_per_pixel:g} m a pixel, as given"), False
+        scale, falls = _upright(metres_per_pixel, height, "as given"), False
     else:
         scale, falls = _scale_of_fall(tracks, dt_s, height), True
     if system is None or positions is None:
@@ -168,7 +168,7 @@ def fit_scale(tracks: Tracks, positions: Tensor) -> Scale:
         order = orders[misfits.argmin(0)].expand(steps, batch, count)
         sorted_ = positions.gather(2, order[..., None].expand_as(positions))
         turn, offset = _plane(tracks.place, sorted_, good)
-    scale = Scale(offset, turn, "the recorded positions")
+    scale = Scale(offset, turn, "fitted to recorded positions")
     size = scale.metres_per_pixel
     off = float(_misfit(tracks.place, sorted_, good, (turn, offset)) / size) if size > 1e-12 else float("inf")
     if not off < AGREES:
@@ -274,7 +274,7 @@ def _scale_of_fall(tracks: Tracks, dt_s: float, height: int) -> Scale:
             "freely; give --metres-per-pixel."
         )
     size = -EARTH[2] * dt_s**2 / down
-    return _upright(size, height, f"{size:.3g} m a pixel, so that things fall with 9.81 m/s2")
+    return _upright(size, height, "so that things fall with 9.81 m/s2")
 
 
 def _things(count: int, falls: bool) -> PhysicalSystem:

@@ -74,7 +74,9 @@ def _judged(motion: Trajectory, keep: Tensor) -> Trajectory:
 
 def _note(tracked: Tracked, kept: float) -> str:
     things = ", ".join(body.name for body in tracked.system.bodies[:-1])
-    words = f"Judged by pictures: {things} tracked, {tracked.scale.metres_per_pixel:.3g} m a pixel by {tracked.scale.source}"
+    words = (
+        f"Judged by pictures: {things} tracked, {tracked.scale.metres_per_pixel:.3g} m a pixel ({tracked.scale.source})"
+    )
     return words + (
         f"; {1 - kept:.0%} of rollouts left out, as something reaches the picture's edge." if kept < 1 else "."
     )

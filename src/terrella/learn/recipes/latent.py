@@ -288,7 +288,7 @@ class _Training:
 
         def broken(numbers: torch.Tensor) -> torch.Tensor:  # the kept recording may be of another body
             assert laws is not None
-            return laws(numbers[: min(sized.size // 2, clips_in(recording))] if kept else numbers)
+            return laws(numbers[: min(max(1, sized.size // 2), clips_in(recording))] if kept else numbers)
 
         objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps, laws and broken)
         trainer = Trainer(self.run, STAGE, sized, objective, total)
