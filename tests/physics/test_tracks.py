@@ -1,5 +1,7 @@
 """Laws over pictures: what moves is tracked to hundredths of a pixel, and injected violations are seen in pictures alone."""
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -119,6 +121,8 @@ def test_bad_pictures_get_a_sentence():
         fit_tracked(pictures, DT_S)
     with pytest.raises(TerrellaError, match="disagree by"):
         fit_tracked(pictures, DT_S, system, places.flip(0))
+    given = fit_tracked(pictures, DT_S, system, places.flip(0), metres_per_pixel=0.01)  # what that error advises
+    assert given.scale.metres_per_pixel == pytest.approx(0.01) and given.system.bodies[0].name == "thing 1"
     with pytest.raises(TerrellaError, match="nothing moves"):
         fit_tracked(pictures[:1, :1].expand(6, 2, -1, -1, -1), DT_S, system, places)
     with pytest.raises(TerrellaError, match="does the camera move"):
@@ -135,3 +139,7 @@ def test_check_judges_pictures(tmp_path):
     assert "The truth above, the world below" in (tmp_path / "check.html").read_text()
     with pytest.raises(TerrellaError, match="--metres-per-pixel is above 0"):
         check("physics:bouncing", CheckConfig(tmp_path / "rec", metres_per_pixel=0.0))
+    with pytest.raises(TerrellaError, match="judged by its numbers"):
+        check("physics:bouncing", CheckConfig(tmp_path / "rec", metres_per_pixel=0.01))
+    config = dataclasses.replace(config, metres_per_pixel=0.05)
+    assert "thing 1 tracked, 0.05 m a pixel (as given)" in check("physics:bouncing", config).summary()

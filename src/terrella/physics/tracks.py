@@ -95,8 +95,9 @@ def fit_tracked(
 ) -> Tracked:
     """What tracks a recording's things, from uint8 pictures [T + 1, B, H, W, 3] of it.
 
-    The scale comes from `positions` [T + 1, B, N, 2] of the system's bodies in their plane, else from `metres_per_pixel`, else from
-    gravity, where things fall freely. TerrellaError where none of them gives one, or where nothing can be tracked."""
+    The scale is `metres_per_pixel`, else of `positions` [T + 1, B, N, 2] of the system's bodies in their plane, else of gravity,
+    where things fall freely. The bodies are the system's where it is from positions, else things of which nothing is known.
+    TerrellaError where none of them gives a scale, or where nothing can be tracked."""
     if metres_per_pixel is not None and not metres_per_pixel > 0:
         raise TerrellaError(f"--metres-per-pixel is above 0; got {metres_per_pixel:g}.")
     if system is not None and len(system.axes) != 2:
@@ -106,14 +107,12 @@ def fit_tracked(
     tracker = fit_tracker(pictures.flatten(0, 1))
     tracks = tracker.follow(pictures)
     height = pictures.shape[2]
-    if system is not None and positions is not None:
-        scale, falls = fit_scale(tracks, positions.double()), False
-    elif metres_per_pixel is not None:
-        scale, falls = _upright(metres_per_pixel, height, "as given"), False
+    if metres_per_pixel is not None:
+        system, scale = _things(tracks.area.shape[2], False), _upright(metres_per_pixel, height, "as given")
+    elif system is not None and positions is not None:
+        scale = fit_scale(tracks, positions.double())
     else:
-        scale, falls = _scale_of_fall(tracks, dt_s, height), True
-    if system is None or positions is None:
-        system = _things(tracks.area.shape[2], falls)
+        system, scale = _things(tracks.area.shape[2], True), _scale_of_fall(tracks, dt_s, height)
     return Tracked(tracker, tracked_system(system), scale)
 
 

@@ -90,6 +90,10 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
     system = system_named(config.system, cache.world.get("system"), opened.spec)
     pictures = config.pictures or needs_pictures(system, opened.spec)
     if not pictures:
+        if config.metres_per_pixel is not None:
+            raise TerrellaError(
+                f"{world} is judged by its numbers; for its pictures, with --metres-per-pixel, add --pictures."
+            )
         opened.spec.check_channels(_described(system, config.system).channels)
     elif not opened.spec.kinds("rgb"):
         raise TerrellaError(f"{world} shows no pictures; leave --pictures out.")

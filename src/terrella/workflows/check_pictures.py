@@ -50,7 +50,7 @@ def motions_in_pictures(
     channel, dt_s = world.spec.kinds("rgb")[0], world.spec.dt_s
     steps = clips[0].horizon
     pictures = [_rows(some, channel) for some in (known, clips)]
-    places = [_positions(system, some, dt_s) for some in (known, clips)]
+    places = [None if metres_per_pixel else _positions(system, some, dt_s) for some in (known, clips)]
     fitted = places[0][:, :FITTED] if places[0] is not None else None
     tracked = fit_tracked(pictures[0][:, :FITTED], dt_s, system, fitted, metres_per_pixel)
     metric = StepMetric((channel,), lambda seen, *_: {channel: seen[channel]})
