@@ -170,6 +170,8 @@ def test_other_settings_and_foreign_files_are_refused(whole, tmp_path):
     with pytest.raises(TrainingError, match=r"other settings \(rate 0.1, not 0.2"):
         trainer_in(whole, rate=0.2)
     assert trainer_in(whole, hours=1.0, save_every_s=5.0).finished, "hours and saves may change"
+    with pytest.raises(TrainingError, match="--seed is 0 or more; got -1"):
+        trainer_in(tmp_path, seed=-1)
     (tmp_path / "resume-toy.safetensors").write_bytes(b"not a run at all")
     with pytest.raises(TrainingError, match="resume-toy.safetensors is not a run of this recipe"):
         trainer_in(tmp_path)

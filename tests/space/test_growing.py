@@ -156,7 +156,7 @@ def test_the_same_seed_grows_the_same_place(tmp_path):
 
 def test_growth_that_cannot_be_is_refused(tmp_path, capsys):
     half_room(tmp_path / "place")
-    for options in (["--to", "0"], ["--to", "1.5"], ["--steps", "0"]):
+    for options in (["--to", "0"], ["--to", "1.5"], ["--steps", "0"], ["--seed", "-1"]):
         assert main(["space", "grow", str(tmp_path / "place"), *options]) == 2
         assert "--to is above 0" in capsys.readouterr().err
     assert main(["space", "grow", str(tmp_path / "none")]) == 2

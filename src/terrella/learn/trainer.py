@@ -86,6 +86,8 @@ class Run:
     ) -> Run:
         """The run of `config`, a dataclass. A resumed run must have the same settings and `facts`; the device, how often is saved
         and the settings in `free` may change. The stages share the `hours` of the settings, if they have any."""
+        if config.seed < 0:
+            raise TrainingError(f"--seed is 0 or more; got {config.seed}.")
         settings = asdict(config)
         times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}

@@ -77,8 +77,8 @@ class GrowthStep:
 def grow_space(world: str, config: GrowSpaceConfig, *, progress: Progress = silent) -> SpaceResult:
     """Adds invented Gaussians to a world of Gaussians where nothing is known. Each step is a place in FOLDER/grown and a merge in
     world.edits.jsonl, so that `space edit --undo` takes it back; the same command goes on where it stopped."""
-    if not 0 < config.to <= 1 or not 1 <= config.steps <= 1000:
-        raise TerrellaError("--to is above 0 and at most 1, and --steps from 1 to 1,000.")
+    if not 0 < config.to <= 1 or not 1 <= config.steps <= 1000 or config.seed < 0:
+        raise TerrellaError("--to is above 0 and at most 1, --steps from 1 to 1,000, and --seed 0 or more.")
     folder, place = folder_of(world), open_splat(world)
     if not len(place.gaussians):
         raise TerrellaError(f"{world} has no Gaussian to grow from.")
