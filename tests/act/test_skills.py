@@ -78,6 +78,8 @@ def test_phrases_have_places_where_words_stand_for_each_other():
         ("go to a after you pick up b and pick up c", (("pick up b", "pick up c"), ("go to a",))),
         ("a and b, then c after you d", (("a", "b"), ("d",), ("c",))),
         ("a, b; c", (("a", "b"), ("c",))),
+        ("After you have a and b, c and d", (("a", "b"), ("c", "d"))),
+        ("a, after that b. Afterwards c", (("a",), ("b",), ("c",))),
         (" . ", ()),
     ],
 )

@@ -12,7 +12,8 @@ from ..sentences import words_of
 
 ARTICLES = ("the", "a", "an")
 MOST_FILLINGS = 64  # instructions that a phrase with open places stands for, at most
-_THEN = re.compile(r"[,;.]?\s*\b(?:and\s+)?then\b[\s,]*|[;.]\s*")
+_THEN = re.compile(r"[,;.]?\s*\b(?:and\s+)?(?:then|after\s+that|afterwards)\b[\s,]*|[;.]\s*")
+_FIRST = re.compile(r"^after\s+(.+?),\s*(.+)$")  # "after A, B" is "B after A"
 _AFTER = re.compile(r"[,]?\s*\bafter\s+(?:you\s+)?(?:have\s+)?")
 _AND = re.compile(r"\s*,\s*(?:and\s+)?|\s+and\s+")
 
@@ -84,11 +85,11 @@ def phrases_of(texts: Iterable[str]) -> dict[Phrase, list[str]]:
 
 
 def goal_of(text: str) -> tuple[tuple[str, ...], ...]:
-    """The phrases of a goal, in groups: the groups in their order, the phrases of a group in any. "A and B, then C" and "C after
-    you A and B" are ((A, B), (C,))."""
+    """The phrases of a goal, in groups: the groups in their order, the phrases of a group in any. "A and B, then C", "C after
+    you A and B" and "after you A and B, C" are ((A, B), (C,))."""
     groups: list[tuple[str, ...]] = []
     for part in _THEN.split(text.strip().lower()):
-        for each in reversed(_AFTER.split(part)):
+        for each in reversed(_AFTER.split(_FIRST.sub(r"\2 after \1", part.strip()))):
             phrases = tuple(phrase.strip() for phrase in _AND.split(each) if words_of(phrase))
             groups += [phrases] if phrases else []
     return tuple(groups)
