@@ -274,7 +274,7 @@ class Minder:
 
 def test_what_the_first_observation_showed_is_remembered(tmp_path):
     world = GymnasiumWorld(Recall)
-    record(world, Minder(), tmp_path / "recording", 900, make_rng(0))
+    record(world, Minder(), tmp_path / "recording", 500, make_rng(0))
     won = {}
     for name, imitation in {"memory": Imitation(remember=8), "last two": Imitation(history=2)}.items():
         facts = train_imitation(tmp_path / "recording", tmp_path / name, QUICK, imitation, quiet)
