@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,10 @@ from .results import folder_name, jsonable, table_lines
 from .score import open_cache
 
 KNOWN = 600  # true rollouts at most, two thirds of them for calibration
+FEWEST_SEEN, PICTURES_BYTES = (
+    150,
+    1 << 30,
+)  # of pictures: true rollouts at least, and the bytes up to which there are more
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,9 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
     length = config.steps + (EDGE if pictures else 0)
     clips = clips_from_cache(cache, chosen, CONTEXT, length, config.rollouts, rng)
     apart = [number for number in every if number not in chosen] or every
-    known = clips_from_cache(cache, apart, CONTEXT, length, KNOWN, rng)
+    known = clips_from_cache(
+        cache, apart, CONTEXT, length, _most_known(opened.spec, length) if pictures else KNOWN, rng
+    )
     if (count := 2 * len(known) // 3) < 99:
         progress(
             f"{count} true rollouts calibrate the tolerances: up to {1 / (count + 1):.1%} false alarms; 99 give 1%, so "
@@ -121,6 +128,12 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
         mine = dream_motion(opened, described, clips, config.steps, chance)
     report = examine_physics(opened.spec.name, others, truth, mine, config.seed, config.coarse)
     return _written(dataclasses.replace(report, notes=notes), config.out or Path("checks") / folder_name(world))
+
+
+def _most_known(spec: Spec, length: int) -> int:
+    """True rollouts of pictures that are held at once."""
+    size = math.prod(spec.channels[spec.kinds("rgb")[0]].shape or ())
+    return max(FEWEST_SEEN, min(KNOWN, PICTURES_BYTES // (size * (CONTEXT + length))))
 
 
 def _written(report: PhysicsReport, out: Path) -> CheckResult:
