@@ -37,8 +37,7 @@ class Drawer:
 
     def __init__(self):
         self.built: list[str] = []
-        self.folder = tempfile.TemporaryDirectory()
-        self.marks = Path(self.folder.name) / "marks.json"
+        self.marks = Path(tempfile.mkdtemp()) / "marks.json"
 
     def cards(self):
         return [

@@ -47,7 +47,7 @@ WORLDS = {
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 2180),
     "flow": (lambda: flow(0), 300),
     "flow that scrolls": (lambda: flow(15), 450),
-    "islet": (lambda: terrella.load("islet"), 600),
+    "islet": (lambda: terrella.load("islet"), 605),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
-from .devices import half_precision
+from .devices import half_is_native, half_precision
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,9 @@ class TrainStep:
     rng: np.random.Generator
     noise: torch.Generator = field(repr=False)
     precise: bool = False
+    halved: list[bool] = field(
+        default_factory=list, repr=False
+    )  # not empty once a network has computed in half precision
 
     def randn(self, *shape: int) -> torch.Tensor:
         """Standard normal noise on the device; a GPU draws it itself, so that nothing is copied to it."""
@@ -37,4 +40,8 @@ class TrainStep:
 
     def half(self) -> torch.autocast | nullcontext:
         """A context in which networks compute in half precision, where that is native."""
-        return nullcontext() if self.precise else half_precision(self.device)
+        if self.precise or not half_is_native(self.device):
+            return nullcontext()
+        if not self.halved:
+            self.halved.append(True)
+        return half_precision(self.device)

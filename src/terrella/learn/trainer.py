@@ -26,7 +26,7 @@ from torch import nn
 from ..core.errors import TrainingError
 from ..core.world import make_rng
 from .budget import Budget
-from .devices import half_is_native, yield_cores
+from .devices import yield_cores
 from .learners import Learner
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 from .sized_feed import Feed, SizedFeed
@@ -141,6 +141,7 @@ class Trainer:
         saved = run.saved_facts(stage)
         for module in objective.modules.values():
             module.to(self.device)
+        self._halved: list[bool] = []
         self._finite: list[torch.Tensor] = []  # of the steps since losses were last read
         if saved:
             self._load()
@@ -246,7 +247,7 @@ class Trainer:
 
     def _go_on_in_float32(self, error: TrainingError) -> None:
         """From the last save, without one from these weights: no step that was not a number changed them."""
-        if self.facts.get("float32") or not half_is_native(self.device):
+        if self.facts.get("float32") or not self._halved:
             raise error
         self._finite.clear()
         if self._file.exists():
@@ -282,7 +283,7 @@ class Trainer:
         computing."""
         rng = np.random.default_rng([self.run.seed, step])
         noise = make_rng(int(rng.integers(2**62)), "cuda" if self.device.type == "cuda" else "cpu")
-        now = TrainStep(step, self.share, self.device, rng, noise, self.facts.get("float32", False))
+        now = TrainStep(step, self.share, self.device, rng, noise, self.facts.get("float32", False), self._halved)
         for learner in self.objective.learners.values():
             if learner.rate is not None:
                 for group in learner.optimiser.param_groups:

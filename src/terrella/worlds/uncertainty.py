@@ -117,7 +117,7 @@ class UncertaintyNetwork(nn.Module):
         low, high = answers[at - 1], answers[at]
         share = ((answer - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
         inside = torch.lerp(errors[at - 1], errors[at], share)
-        below, above = (answer[:, None] / answers[:: KNOTS - 1].clamp_min(1e-6)).unbind(1)
+        below, above = (answer[..., None] / answers[:: KNOTS - 1].clamp_min(1e-6)).unbind(-1)
         return torch.minimum(inside * below.clamp_max(1) * above.clamp_min(1), self.ceiling)
 
 
