@@ -128,6 +128,7 @@ def test_the_command_says_what_was_gained_and_what_was_forgotten(made, tmp_path,
         main(["adapt", run, "--from", str(new), "--keep", str(old), "--out", out, "--steps", "4", "--batch", "8"]) == 0
     )
     said = capsys.readouterr().out
+    assert f"next: terrella train policy --out {out}-policy --in {out}" in said  # without pictures it cannot be played
     assert said.startswith("After 16 steps its error on the new recording is") and "On the old one it is" in said
     assert main(["adapt", "doom-maze", "--from", str(new), "--out", out]) == 2
     assert "is no latent world" in capsys.readouterr().err

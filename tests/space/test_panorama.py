@@ -97,6 +97,14 @@ def test_panoramas_are_told_from_wide_pictures():
     assert not wraps(slope)  # 2:1, but its edges do not meet
 
 
+def test_a_wide_picture_that_could_be_a_panorama_is_said_to_be_none(tmp_path):
+    slope = np.broadcast_to(np.linspace(0, 255, 128)[None, :, None], (64, 128, 3)).astype(np.uint8)
+    Image.fromarray(slope).save(tmp_path / "a.png")
+    small = terrella.LiftSpaceConfig(longest=64)
+    facts = terrella.generate_place(tmp_path / "place", image=tmp_path / "a.png", config=small).facts
+    assert "edges do not meet (--panorama" in facts["notes"][0]
+
+
 def test_panoramas_go_in_and_come_out(tmp_path, capsys):
     picture = (255 * room(160).rgb.permute(1, 2, 0)).byte().numpy()
     Image.fromarray(picture).save(tmp_path / "all.png")

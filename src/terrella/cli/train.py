@@ -49,8 +49,7 @@ def latent(data: RecordingName, out: str, config: LatentTraining, json: Json = F
         data: The recording: a folder, or an address (hf://..., s3://...).
         out: Folder of the run: the world, a log, validation.json, and pictures of truth and prediction.
     """
-    following = command("terrella", "train", "policy", out=f"{out.rstrip('/')}-policy", **{"in": out, "from": data})
-    show(train_latent(data, out, config, progress=say), json, following)
+    show(train_latent(data, out, config, progress=say), json, _practising(out, data))
 
 
 def goals(
@@ -91,7 +90,7 @@ def adapt(
         keep: A recording that the world was trained on. Half of each batch is of it, so that less is forgotten, and how much is
             forgotten is measured.
     """
-    show(adapt_world(name, data, out, config, keep=keep, progress=say), json, _playing(out))
+    show(adapt_world(name, data, out, config, keep=keep, progress=say), json, _practising(out, data))
 
 
 def estimator(data: RecordingName, out: str, config: EstimatorTraining, json: Json = False) -> None:
@@ -185,6 +184,10 @@ def dreams(
 
 def _shown(recipe: Callable[[Report], dict], json: bool, following: str = "", **facts: str) -> None:
     show(run_recipe(recipe, say, **facts), json, following)
+
+
+def _practising(out: str, data: str) -> str:
+    return command("terrella", "train", "policy", out=f"{out.rstrip('/')}-policy", **{"in": out, "from": data})
 
 
 def _playing(out: str) -> str:

@@ -66,6 +66,10 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
             else ["taken as a panorama: it is 2:1 and its edges meet (--fov makes it a plain picture)."]
         )
         return _lift_panorama(picture, rgb, out, config, lifter, notes)
+    if config.fov is None and abs(rgb.shape[1] / rgb.shape[0] - 2) < 0.01:
+        notes.append(
+            "taken as a picture of one direction, for its left and right edges do not meet (--panorama: of all)."
+        )
     rgb = read_picture(picture, longest=config.longest)
     height, width = rgb.shape[:2]
     if max(height, width) > MOST_ASPECT * min(height, width):
