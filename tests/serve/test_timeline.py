@@ -111,9 +111,11 @@ def test_a_running_game_does_not_rewind():
 
 def test_done_begins_the_next_episode():
     timeline = Timeline([Panorama(length=3)], seed=0)
-    flags = [timeline.step(WALK).flags for _ in range(5)]
-    assert flags == [0, 0, DONE, FRESH, 0]
+    flags, endings = zip(*[(timeline.step(WALK).flags, timeline.ending) for _ in range(5)])
+    assert flags == (0, 0, DONE, FRESH, 0)
     assert timeline.shown.episode_return == 1.0
+    assert [ending is not None for ending in endings] == [False, False, True, False, False]
+    assert {"steps": 3, "score": 3.0, "vitals": ()}.items() <= endings[2].items(), "a page may miss its last picture"
 
 
 def test_memory_is_bounded():

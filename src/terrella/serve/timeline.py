@@ -78,7 +78,7 @@ class Timeline:
         self.obeyed = self.spec if keys is None else keys  # the spec whose keys a person presses
         self.no_rewind = no_rewind(worlds)
         self.notice = ""  # a message for the person, in one sentence
-        self.ending: dict[str, object] | None = None  # of an episode that is over: outcome, text, steps
+        self.ending: dict[str, object] | None = None  # of an episode that is over: outcome, text, steps, vitals, score
         self.cameras: tuple[str, ...] = ("rgb",)  # the picture channels that are shown
         self.driver = Driver(agents_of(policy), worlds[0])
         self.recording = SessionRecording(sink_factory)
@@ -319,10 +319,9 @@ class Timeline:
         done = bool(seen["done"][0]) if "done" in seen and acted else False
         age = 0 if flags & FRESH else self.shown.age + 1
         numbers = self._numbers(seen, acted, bool(flags & FRESH))
-        self.ending = (
-            dict(outcome(numbers_of(self.spec), numbers, reward, self._return, age), steps=age) if done else None
-        )
+        ended = outcome(numbers_of(self.spec), numbers, reward, self._return, age)
         self._return += reward
+        self.ending = dict(ended, steps=age, vitals=numbers, score=self._return) if done else None
         self.recording.add(seen, action, reward, done)
         self.notice = self.recording.fault or self.notice
         moment = Moment(

@@ -206,11 +206,11 @@ function explained(name) {
 /** A number as it is shown: nobody has less than no health, though a blow may take more than was left. */
 function figure(name, value) { return +(LIFE.test(name) ? Math.max(0, value) : value).toFixed(1); }
 
-/** The last picture of an episode, with how it ended, until the next begins. */
-function showEnding({ outcome, text, steps }) {
-  const seconds = steps * worlds[0].dt_s, numbers = worlds[0].vitals.map((name, at) => [name, now.vitals[at]]).filter(([name, value]) => value && !LIFE.test(name));
+/** The last picture of an episode, with how it ended, until the next begins. Its numbers come with it: a slow page may never have painted that picture. */
+function showEnding({ outcome, text, steps, vitals, score }) {
+  const seconds = steps * worlds[0].dt_s, numbers = worlds[0].vitals.map((name, at) => [name, vitals[at]]).filter(([name, value]) => value && !LIFE.test(name));
   $('ending-text').textContent = text;
-  $('ending-more').textContent = [...numbers.map(([name, value]) => `${+value.toFixed(1)} ${label(name)}`), worlds[0].scored && `score ${+now.score.toFixed(1)}`, `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`].filter(Boolean).join(' · ');
+  $('ending-more').textContent = [...numbers.map(([name, value]) => `${+value.toFixed(1)} ${label(name)}`), worlds[0].scored && `score ${+score.toFixed(1)}`, `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)} s`].filter(Boolean).join(' · ');
   app.dataset.outcome = outcome;
   app.classList.add('ended');
 }
