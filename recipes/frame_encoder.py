@@ -12,9 +12,7 @@ same picture spoilt otherwise (contrast). Nothing is labelled by hand and nothin
 from __future__ import annotations
 
 import argparse
-import functools
 import hashlib
-import io
 import math
 import multiprocessing
 import time
@@ -24,6 +22,7 @@ import gymnasium
 import numpy as np
 import torch
 import torch.nn.functional as F
+from frame_distortions import LEVELS, NEW_WAYS, WAYS, blur, spoil  # beside this file
 from PIL import Image, ImageDraw
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -163,158 +162,6 @@ def _drawn(_: str, count: int, seed: int) -> np.ndarray:
     return drawings(count, seed)
 
 
-# --- ways to spoil a picture; strength 0..1, pictures float [N, 3, H, W] in 0..255, each its own strength -----------------
-
-
-def _uniform(shape, low, high, rng) -> torch.Tensor:
-    return low + (high - low) * torch.rand(shape, generator=rng)
-
-
-def _blur_by(x: torch.Tensor, sigma: float) -> torch.Tensor:
-    if sigma < 0.15:
-        return x
-    reach = max(1, math.ceil(2.5 * sigma))
-    taps = torch.exp(-((torch.arange(-reach, reach + 1).float() / sigma) ** 2) / 2)
-    taps = taps / taps.sum()
-    channels = x.shape[1]
-    x = F.pad(x, (reach,) * 4, mode="reflect")
-    x = F.conv2d(x, taps.view(1, 1, 1, -1).expand(channels, 1, 1, -1), groups=channels)
-    return F.conv2d(x, taps.view(1, 1, -1, 1).expand(channels, 1, -1, 1), groups=channels)
-
-
-def _each(spoil):
-    """Lifts spoil(picture [1, 3, H, W], strength, rng) to a batch."""
-
-    @functools.wraps(spoil)
-    def over(x, strength, rng):
-        return torch.cat([spoil(x[k : k + 1], float(s), rng) for k, s in enumerate(strength)])
-
-    return over
-
-
-@_each
-def blur(x, strength, rng):
-    return _blur_by(x, 3 * strength)
-
-
-def noise(x, strength, rng):
-    return x + 40 * strength.view(-1, 1, 1, 1) * torch.randn(x.shape, generator=rng)
-
-
-@_each
-def jpeg(x, strength, rng):
-    picture = Image.fromarray(x[0].permute(1, 2, 0).clamp(0, 255).byte().numpy())
-    buffer = io.BytesIO()
-    picture.save(buffer, "JPEG", quality=round(60 * (1 - strength) ** 1.5 + 3))
-    return torch.from_numpy(np.array(Image.open(buffer))).permute(2, 0, 1)[None].float()
-
-
-@_each
-def coarse(x, strength, rng):
-    """Down and up again, hard (pixels) or soft."""
-    small = (max(4, round(x.shape[2] / (1 + 4 * strength))), max(4, round(x.shape[3] / (1 + 4 * strength))))
-    mode = "nearest" if torch.rand((), generator=rng) < 0.5 else "bilinear"
-    return F.interpolate(F.interpolate(x, small, mode="area"), x.shape[2:], mode=mode)
-
-
-def colour(x, strength, rng):
-    """A cast: each channel its own offset and gain."""
-    s = strength.view(-1, 1, 1, 1)
-    tint = torch.randn((len(x), 3, 1, 1), generator=rng)
-    return x * (1 + 0.25 * s * torch.randn((len(x), 3, 1, 1), generator=rng)) + 35 * s * tint
-
-
-def contrast(x, strength, rng):
-    """Paler or harsher about the mean, darker or lighter."""
-    s = strength.view(-1, 1, 1, 1)
-    sign = torch.where(torch.rand((len(x), 1, 1, 1), generator=rng) < 0.6, -1.0, 1.0)
-    mean = x.mean((1, 2, 3), keepdim=True)
-    return mean + (x - mean) * (1 + 0.8 * s * sign) + 40 * s * torch.randn((len(x), 1, 1, 1), generator=rng)
-
-
-@_each
-def holes(x, strength, rng):
-    """Things gone: boxes filled from their left and right edges."""
-    x, (h, w) = x.clone(), x.shape[2:]
-    for _ in range(1 + int(5 * strength)):
-        high, wide = (int(_uniform((), 0.08, 0.12 + 0.3 * strength, rng) * side) + 2 for side in (h, w))
-        top, left = int(_uniform((), 0, h - high, rng)), int(_uniform((), 1, max(2, w - wide - 1), rng))
-        right = min(left + wide, w - 1)
-        share = torch.linspace(0, 1, right - left)
-        a, b = x[:, :, top : top + high, left - 1, None], x[:, :, top : top + high, right, None]
-        x[:, :, top : top + high, left:right] = a * (1 - share) + b * share
-    return x
-
-
-@_each
-def strange(x, strength, rng):
-    """Wrong texture: boxes filled with a turned, scaled piece from elsewhere in the picture, or with noise alike."""
-    x, (h, w), source = x.clone(), x.shape[2:], x
-    for _ in range(1 + int(5 * strength)):
-        high, wide = (int(_uniform((), 0.1, 0.15 + 0.35 * strength, rng) * side) + 3 for side in (h, w))
-        top, left = int(_uniform((), 0, h - high, rng)), int(_uniform((), 0, w - wide, rng))
-        from_top, from_left = int(_uniform((), 0, h - high, rng)), int(_uniform((), 0, w - wide, rng))
-        piece = source[:, :, from_top : from_top + high, from_left : from_left + wide]
-        if torch.rand((), generator=rng) < 0.5:
-            piece = F.interpolate(piece.transpose(2, 3).flip(3), (high, wide), mode="bilinear")
-        else:
-            size = int(torch.randint(1, 5, (), generator=rng))
-            grain = torch.randn((1, 3, high // size + 1, wide // size + 1), generator=rng)
-            grain = F.interpolate(grain, scale_factor=size, mode="nearest")[:, :, :high, :wide]
-            piece = piece.mean((2, 3), keepdim=True) + piece.std((2, 3), keepdim=True) * grain
-        x[:, :, top : top + high, left : left + wide] = piece
-    return x
-
-
-def bent(x, strength, rng):
-    """Wrong geometry: straight lines become wavy."""
-    n, _, h, w = x.shape
-    field = F.interpolate(torch.randn((n, 2, 5, 6), generator=rng), (h, w), mode="bicubic", align_corners=True)
-    ys, xs = torch.meshgrid(torch.linspace(-1, 1, h), torch.linspace(-1, 1, w), indexing="ij")
-    grid = torch.stack([xs, ys], -1) + 0.12 * strength.view(-1, 1, 1, 1) * field.permute(0, 2, 3, 1)
-    return F.grid_sample(x, grid, mode="bicubic", padding_mode="reflection", align_corners=True)
-
-
-@_each
-def ghost(x, strength, rng):
-    """A second, shifted picture shines through: what an average of two futures looks like."""
-    shift = [
-        int(torch.randint(2, 9, (), generator=rng)) * (1 - 2 * int(torch.randint(2, (), generator=rng))) for _ in "yx"
-    ]
-    return (1 - 0.5 * strength) * x + 0.5 * strength * torch.roll(x, shift, (2, 3))
-
-
-@_each
-def ringing(x, strength, rng):
-    return x + 2.5 * strength * (x - _blur_by(x, 1.2))
-
-
-@_each
-def tiles(x, strength, rng):
-    """Squares lose their detail, or their place: what a coarse tokenizer does."""
-    side = (4, 8, 16)[int(torch.randint(3, (), generator=rng))]
-    h, w = x.shape[2] // side * side, x.shape[3] // side * side
-    mean = F.interpolate(F.avg_pool2d(x[:, :, :h, :w], side), scale_factor=side, mode="nearest")
-    some = (torch.rand((1, 1, h // side, w // side), generator=rng) < strength).float()
-    some = F.interpolate(some, scale_factor=side, mode="nearest")
-    x = x.clone()
-    x[:, :, :h, :w] = x[:, :, :h, :w] * (1 - some) + (0.2 * x[:, :, :h, :w] + 0.8 * mean) * some
-    return x
-
-
-WAYS = (blur, noise, jpeg, coarse, colour, contrast, holes, strange, bent, ghost, ringing, tiles)
-
-
-def spoil(pictures: torch.Tensor, way: torch.Tensor, strength: torch.Tensor, rng) -> torch.Tensor:
-    """Each picture in its own way (-1 none), rounded to bytes as a screen would."""
-    out = pictures.clone()
-    for number, spoiler in enumerate(WAYS):
-        mine = (way == number).nonzero()[:, 0]
-        if len(mine):
-            out[mine] = spoiler(pictures[mine], strength[mine], rng)
-    return out.clamp(0, 255).round()
-
-
 # --- training -----------------------------------------------------------------------------------------------------------
 
 
@@ -399,7 +246,9 @@ def batch_of(pictures: torch.Tensor, bases: int, rng) -> tuple[torch.Tensor, tor
     return torch.cat(crops), target.repeat(2, 1)
 
 
-def train(out: Path, steps: int, bases: int = 20, seed: int = 0, told: float = 8.0, known: float = 0.5) -> None:
+def train(
+    out: Path, steps: int, bases: int = 20, seed: int = 0, regression: float = 8.0, contrast: float = 0.5
+) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(seed)
     rng = terrella.make_rng(seed)
@@ -419,13 +268,15 @@ def train(out: Path, steps: int, bases: int = 20, seed: int = 0, told: float = 8
         partner = torch.arange(len(name)).roll(len(name) // 2)
         contrast_loss = F.cross_entropy(alike, partner)
         optimiser.zero_grad()
-        (told * regress + known * contrast_loss).backward()
+        (regression * regress + contrast * contrast_loss).backward()
         optimiser.step()
         right = (alike.argmax(1) == partner).float().mean()
         losses.append([float(regress.detach()), float(contrast_loss.detach()), float(right)])
         if step % 50 == 0:
             means, took = np.mean(losses[-50:], 0), time.process_time() - began
-            print(f"{step} {took:.0f}s told {means[0]:.4f} known {means[1]:.3f} right {means[2]:.2f}", flush=True)
+            print(
+                f"{step} {took:.0f}s regression {means[0]:.4f} contrast {means[1]:.3f} right {means[2]:.2f}", flush=True
+            )
     done = pupil.finished()
     read_out(done, pictures[torch.randperm(len(pictures), generator=rng)[:2400]], rng)
     path = out / "frame_encoder.safetensors"
@@ -434,54 +285,6 @@ def train(out: Path, steps: int, bases: int = 20, seed: int = 0, told: float = 8
 
 
 # --- the table ------------------------------------------------------------------------------------------------------------
-# Ways that training did not use: whoever learns to tell twelve ways apart should feel the thirteenth too.
-
-
-@_each
-def smeared(x, strength, rng):
-    """Motion blur along a line."""
-    reach = 1 + int(10 * strength)
-    angle = float(_uniform((), 0, math.pi, rng))
-    steps = [(round(k * math.sin(angle)), round(k * math.cos(angle))) for k in range(reach + 1)]
-    return torch.stack([torch.roll(x, step, (2, 3)) for step in steps]).mean(0)
-
-
-@_each
-def median(x, strength, rng):
-    size = 3 + 2 * round(3 * strength)
-    windows = F.unfold(F.pad(x, (size // 2,) * 4, mode="reflect").transpose(0, 1), size)
-    return windows.median(1).values.reshape(x.shape)
-
-
-def pepper(x, strength, rng):
-    hit = torch.rand((len(x), 1, *x.shape[2:]), generator=rng) < 0.08 * strength.view(-1, 1, 1, 1)
-    return torch.where(hit, 255.0 * (torch.rand(hit.shape, generator=rng) < 0.5), x)
-
-
-def posters(x, strength, rng):
-    step = (8 + 80 * strength).view(-1, 1, 1, 1)
-    return (x / step).round() * step
-
-
-@_each
-def shuffled(x, strength, rng):
-    """Squares of 16 pixels change places."""
-    h, w = x.shape[2] // 16, x.shape[3] // 16
-    squares = x.unfold(2, 16, 16).unfold(3, 16, 16).flatten(2, 3).clone()
-    some = torch.randperm(h * w, generator=rng)[: max(2, round(strength * h * w))]
-    squares[:, :, some] = squares[:, :, some.roll(1)]
-    return squares.reshape(1, 3, h, w, 16, 16).permute(0, 1, 2, 4, 3, 5).reshape(1, 3, h * 16, w * 16)
-
-
-def hue(x, strength, rng):
-    """Colours turned about grey by up to a third of the circle, one way for all."""
-    angle = (2 * math.pi / 3 * strength).view(-1, 1, 1, 1)
-    grey, across = x.mean(1, keepdim=True), (x.roll(1, 1) - x.roll(2, 1)) / math.sqrt(3)
-    return grey + (x - grey) * angle.cos() + across * angle.sin()
-
-
-NEW_WAYS = (smeared, median, pepper, posters, shuffled, hue)
-LEVELS = (0.1, 0.3, 0.6, 1.0)
 
 
 def pixel_statistics(frames: torch.Tensor) -> torch.Tensor:
@@ -546,14 +349,14 @@ def table(out: Path, count: int = 100) -> None:
         for way in names:
             steps = [[ladders[eye, name, way, level] for level in LEVELS] for name in tests]
             rise = [all(a.value < b.value for a, b in zip(row, row[1:])) for row in steps]
-            told = [[f.low > floors[name].high for f in row] for name, row in zip(tests, steps)]
-            rises, seen, cells = rises + sum(rise), seen + sum(map(sum, told)), cells + sum(map(len, told))
+            differs = [[f.low > floors[name].high for f in row] for name, row in zip(tests, steps)]
+            rises, seen, cells = rises + sum(rise), seen + sum(map(sum, differs)), cells + sum(map(len, differs))
             means = " | ".join(f"{np.mean([row[k].value for row in steps]):.3g}" for k in range(len(LEVELS)))
             first = " ".join(f"{f.value:.3g} [{f.low:.3g}, {f.high:.3g}]" for f in steps[0])
             print(
-                f"| {way} | {means} | {sum(rise)}/{len(rise)} | {sum(map(sum, told))}/{sum(map(len, told))} | {first}"
+                f"| {way} | {means} | {sum(rise)}/{len(rise)} | {sum(map(sum, differs))}/{sum(map(len, differs))} | {first}"
             )
-        print(f"{eye}: rises in {rises} of {len(names) * len(tests)}, told from real in {seen} of {cells}")
+        print(f"{eye}: rises in {rises} of {len(names) * len(tests)}, differs from real in {seen} of {cells}")
     versus(tests, eyes, rng, count)
 
 

@@ -11,7 +11,7 @@ from terrella.act.actor_network import ActorConfig
 from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
 from terrella.act.sentences import vocabulary_of
 from terrella.act.skills.library import Skill, SkillLibrary
-from terrella.act.skills.phrases import goal_of, phrases_of
+from terrella.act.skills.phrases import Phrase, goal_of, phrases_of
 from terrella.act.skills.predictor import SkillOutlook, SkillPredictor
 from terrella.act.skills.search import SkillSearch, undone
 from terrella.core.errors import CheckpointError, PlanningError
@@ -68,6 +68,9 @@ def test_phrases_have_places_where_words_stand_for_each_other():
     assert str(going) == "go to the blue|red box|key"
     assert going.fillings("go to red key".split()) == ["go to the red key"] == going.fillings("go to a red key".split())
     assert going.fillings("go to the box".split()) == ["go to the blue box", "go to the red box"]
+    many = Phrase((("put",), *[("red", "blue", "green")] * 4))
+    with pytest.raises(PlanningError, match="'put' leaves 81 instructions open, and 64 are searched: say more"):
+        many.fillings(["put"])
     assert not going.fillings("go to the red key now".split()) and not going.fillings("pick up the red key".split())
 
 
@@ -132,6 +135,9 @@ def test_a_library_is_written_renamed_and_read(tmp_path):
     assert read.named("walk").tries == 100 and read.named("walk").works == pytest.approx(99 / 102)
     seen, texts = {"hand": torch.zeros(2, 1)}, ["go to the red key", "pick up the blue box"]
     assert torch.allclose(read.outlook(seen, texts).begins, library.outlook(seen, texts).begins)
+    learned_again = library.named_as(tmp_path)
+    assert [skill.name for skill in learned_again.skills] == [skill.name for skill in read.skills]
+    assert library.named_as(tmp_path / "none") is library
     assert read.end_texts == library.end_texts and read.skill_of("go to the red key").name == "walk"
     with pytest.raises(PlanningError, match="no skill 'wolk'; did you mean 'walk'"):
         read.named("wolk")

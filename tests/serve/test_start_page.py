@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shutil
 import tempfile
 import threading
 import urllib.error
 import urllib.request
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,7 +39,9 @@ class Drawer:
 
     def __init__(self):
         self.built: list[str] = []
-        self.marks = Path(tempfile.mkdtemp()) / "marks.json"
+        folder = tempfile.mkdtemp()
+        weakref.finalize(self, shutil.rmtree, folder)
+        self.marks = Path(folder) / "marks.json"
 
     def cards(self):
         return [

@@ -306,12 +306,14 @@ def test_what_cannot_be_lifted_is_refused_in_one_sentence_and_nothing_is_written
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "many").mkdir()
     picture_file(tmp_path / "many" / "a.png")
+    (tmp_path / "empty").mkdir()
     long = picture_file(tmp_path / "long.png", (1280, 64))
     for path, words in (
         (tmp_path / "text.png", "cannot be read"),
         (tmp_path / "none.png", "does not exist; check the path"),
         (long, "4 to 1"),
         (tmp_path / "many", "terrella space fit"),
+        (tmp_path / "empty", "a folder without pictures"),
     ):
         code, error = lifted(path, tmp_path, capsys)
         assert code != 0 and words in error and not (tmp_path / "place").exists()

@@ -167,6 +167,8 @@ def _frames(picture: Path) -> list[str]:
         )
     if not picture.exists():
         raise DatasetError(f"{picture} does not exist; check the path.")
+    if picture.is_dir():
+        raise DatasetError(f"{picture} is a folder without pictures; give a picture, or a folder of them to space fit.")
     try:
         with Image.open(picture) as opened:
             many = getattr(opened, "n_frames", 1)

@@ -75,6 +75,19 @@ class SkillLibrary:
             raise PlanningError(f"'{new}' is no free name for a skill; choose another.")
         return self._with(replace(self.named(name), name=new), name)
 
+    def named_as(self, folder: str | Path) -> SkillLibrary:
+        """The library with the names that a folder's library has for the same phrases; itself where there is none."""
+        try:
+            earlier = {skill.phrase: skill.name for skill in SkillLibrary.load(folder).skills}
+        except CheckpointError:
+            return self
+        named, names = self, {skill.name for skill in self.skills}
+        for skill in self.skills:
+            name = earlier.get(skill.phrase, skill.name)
+            if name not in names:
+                named = named.renamed(skill.name, name)
+        return named
+
     def tried(self, name: str, tries: int, successes: int) -> SkillLibrary:
         """The library with further attempts of a skill."""
         skill = self.named(name)

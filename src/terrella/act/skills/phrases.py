@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from ...core.errors import PlanningError
 from ..sentences import words_of
 
 ARTICLES = ("the", "a", "an")
@@ -33,11 +35,17 @@ class Phrase:
         return " ".join("|".join(place) for place in self.places)
 
     def fillings(self, words: Sequence[str]) -> list[str]:
-        """The instructions of this phrase that these words leave open; [] if they do not fit. Articles may be left out."""
+        """The instructions of this phrase that these words leave open; [] if they do not fit. Articles may be left out.
+        PlanningError for more than MOST_FILLINGS."""
         chosen = self._fit(tuple(words), 0)
         if chosen is None:
             return []
-        return [" ".join(each) for each in itertools.islice(itertools.product(*chosen), MOST_FILLINGS)]
+        if (count := math.prod(map(len, chosen))) > MOST_FILLINGS:
+            raise PlanningError(
+                f"'{' '.join(words)}' leaves {count} instructions open, and {MOST_FILLINGS} are searched: say more of "
+                f"'{self.name}'."
+            )
+        return [" ".join(each) for each in itertools.product(*chosen)]
 
     def _fit(self, words: tuple[str, ...], at: int) -> list[tuple[str, ...]] | None:
         """The words for each place from `at` on."""
