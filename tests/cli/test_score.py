@@ -141,6 +141,8 @@ def test_score_of_a_recording_without_held_out_episodes_is_refused(tmp_path, mon
     assert "none was kept out of training" in said and "--fresh" in said and len(said.splitlines()) <= 2
     assert main([*arguments(tmp_path / "set", tmp_path / "out"), "--fresh"]) == 2
     assert "record longer episodes" in capsys.readouterr().err
+    assert main([*arguments(tmp_path / "set", tmp_path / "out"), "--seed", "-1"]) == 2
+    assert "--seed is 0 or more; got -1." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("names", (("a", "b", "c", "d", "e", "f"), ("fire",)))

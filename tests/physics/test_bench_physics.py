@@ -63,5 +63,7 @@ def test_bad_input_gets_a_sentence(tmp_path):
         bench_physics(None, BenchPhysicsConfig(families=("rocket",), out=tmp_path))
     with pytest.raises(TerrellaError, match="leave one of them out"):
         bench_physics("islet", BenchPhysicsConfig(train=1.0, out=tmp_path))
+    with pytest.raises(TerrellaError, match="--seed is 0 or more; got -1"):
+        bench_physics(None, BenchPhysicsConfig(seed=-1, out=tmp_path))
     with pytest.raises(TerrellaError, match="above 0 minutes"):
         bench_physics(None, BenchPhysicsConfig(train=0.0, out=tmp_path))

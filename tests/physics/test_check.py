@@ -83,9 +83,11 @@ def test_films_show_the_body_where_it_is():
 def test_bad_input_gets_a_sentence(recording, tmp_path):
     with pytest.raises(TerrellaError, match="--rollouts and --steps are 2 or more"):
         check("physics:bouncing", CheckConfig(recording, steps=1))
+    with pytest.raises(TerrellaError, match="--seed is 0 or more; got -1"):
+        check("physics:bouncing", CheckConfig(recording, seed=-1))
     with pytest.raises(TerrellaError, match="is no JSON file"):
         check("physics:bouncing", CheckConfig(recording, system=str(tmp_path / "none.json")))
-    with pytest.raises(DatasetError, match="no window of 104 rows"):
+    with pytest.raises(DatasetError, match="no window of 104 rows .* take fewer --steps, or record longer"):
         check("physics:bouncing", CheckConfig(recording, steps=100))
     with pytest.raises(TerrellaError, match="cannot render"):
         check("physics:bouncing", CheckConfig(recording, system="physics:rolling"))

@@ -13,6 +13,7 @@ from terrella.core.errors import ChannelError, TerrellaError
 from terrella.physics import LAWS, PhysicalSystem, RigidBody, Rod, Slot, Wall, calibrate, certify, trajectory_of
 from terrella.physics.constants import friction, gravity, restitution
 from terrella.physics.gaps import body_gaps, wall_gaps
+from terrella.physics.laws.energy import energy, energy_scale
 from terrella.physics.tolerance import detection, false_alarm_rate
 from terrella.sim.bodies import FAMILIES, BodiesConfig, BodiesWorld
 
@@ -204,3 +205,28 @@ def test_a_mujoco_model_describes_its_bodies_walls_and_limits(tmp_path):
     assert [wall.centre_m for wall in system.walls] == [(0.0, 0.0, 0.0), (0.0, 2.0, 1.0)]
     assert system.hidden == ("flap",) and "flap" in LAWS[1].missing(system)
     assert [(one.name, round(one.high, 3)) for one in system.limits] == [("hinge", 1.047)]
+
+
+def without_velocities(motion):
+    """The same motion, from positions alone."""
+    bodies = tuple(replace(body, velocity=None) for body in motion.system.bodies)
+    return trajectory_of(replace(motion.system, bodies=bodies), motion.channels, motion.dt_s)
+
+
+def test_a_body_at_rest_has_no_speed_where_only_its_position_is_known():
+    seen = {"position": torch.tensor([0.0, 0.2]).expand(12, 3, 2)}
+    ball = RigidBody("ball", Slot("position"), radius_m=0.2)
+    motion = trajectory_of(PhysicalSystem((ball,), (FLOOR,), axes=(0, 2)), seen, 0.025)
+    assert float(motion.velocity.abs().max()) == 0
+    assert float(energy(motion).std(0).max()) == 0
+
+
+@pytest.mark.parametrize("family, most", [("pendulum", 0.002), ("parabola", 1e-6)])
+def test_energy_is_constant_where_only_positions_are_known(family, most):
+    motion = without_velocities(truth(family, 2, 100))
+    assert float((energy(motion).std(0) / energy_scale(motion)[-1]).max()) < most
+
+
+def test_positions_alone_give_the_speed_of_flight():
+    motion = truth("parabola", 2, 100)
+    assert torch.allclose(without_velocities(motion).velocity, motion.velocity, atol=1e-4)

@@ -1,4 +1,4 @@
-"""A single number in any of the forms in which environments give one."""
+"""A single number in any of the forms in which environments give one, and seeds."""
 
 from typing import Any
 
@@ -20,3 +20,9 @@ def single_number(value: Any, what: str) -> float:
         array = np.asarray(None)
     form = f"an array of shape {array.shape}" if array.ndim else f"{value!r:.80}"
     raise TerrellaError(f"{what} is {form}, and one number is needed: wrap the environment so that it gives one.")
+
+
+def check_seed(seed: int) -> None:
+    """TerrellaError for a seed below 0."""
+    if seed < 0:
+        raise TerrellaError(f"--seed is 0 or more; got {seed}.")

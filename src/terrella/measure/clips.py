@@ -110,11 +110,12 @@ def clips_from_cache(
     count: int,
     rng: torch.Generator,
     where: Where | None = None,
+    advice: str = "record longer episodes or ask for a shorter horizon",
 ) -> list[Clip]:
     """Up to `count` windows without overlap, drawn at random from `episodes` of a clip cache.
 
     Windows have valid actions, no end (`done`), and only rows that `where` allows. Windows without motion are kept (see
-    Clip.moves). Fewer are returned if the recording has no more; DatasetError if it has none.
+    Clip.moves). Fewer are returned if the recording has no more; DatasetError with `advice` if it has none.
     """
     if where is not None and cache.pose is None:
         raise DatasetError("choosing clips by place needs recorded poses; leave `where` out.")
@@ -132,7 +133,7 @@ def clips_from_cache(
         inside = "" if where is None else " and lies in the part of the map that is scored"
         raise DatasetError(
             f"no window of {length} rows ({context} of context, {horizon} of horizon) fits in an episode{inside}; "
-            "record longer episodes or ask for a shorter horizon."
+            f"{advice}."
         )
     order = torch.randperm(len(starts), generator=rng).tolist()[:count]
     return [_cut(cache, starts[pick], length, context) for pick in order]

@@ -198,11 +198,9 @@ def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], d
     if body.velocity is not None:
         velocity = _spread(_numbers(flat, body.velocity, len(system.axes)), system.axes)
     elif len(position) > 1:
-        half = (
-            0.0 if body.driven else 0.5 * dt_s * position.new_tensor(system.gravity_m_s2)
-        )  # to the end of each step, in flight
-        velocity = position.diff(dim=0) / dt_s
-        velocity = torch.cat([velocity[:1] - half, velocity + half])
+        way = position.diff(dim=0)
+        half = _gained(system, body, way, dt_s)  # from the middle of each step to its end
+        velocity = torch.cat([way[:1] / dt_s - half[:1], way / dt_s + half])
     else:
         velocity = torch.zeros_like(position)
     upright = position.new_tensor([1.0, 0, 0, 0]).expand(*position.shape[:2], 4)
@@ -218,6 +216,19 @@ def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], d
     given = body.radius_m
     radius = _numbers(flat, given, 1)[..., 0] if isinstance(given, Slot) else torch.full_like(position[..., 0], given)
     return position.nan_to_num(), velocity.nan_to_num(), rotation, spin.nan_to_num(), here, radius
+
+
+def _gained(system: PhysicalSystem, body: RigidBody, way: Tensor, dt_s: float) -> Tensor:
+    """The velocity [T, B, 3] that gravity adds in half of each step to a body that goes `way`: none where it is driven, on a rod,
+    or at rest, which is two steps in a row with less than a quarter of g dt2 along gravity (in flight they differ by g dt2)."""
+    gravity = way.new_tensor(system.gravity_m_s2)
+    if body.driven or body.name in {rod.body for rod in system.rods}:
+        return torch.zeros_like(way)
+    slow = (way @ gravity).abs() < 0.25 * gravity.square().sum() * dt_s**2
+    beside = torch.zeros_like(slow)
+    beside[1:] |= slow[:-1]
+    beside[:-1] |= slow[1:]
+    return torch.where((slow & beside)[..., None], 0.0, 0.5 * dt_s * gravity)
 
 
 def _numbers(flat: Mapping[str, Tensor], slot: Slot, count: int) -> Tensor:

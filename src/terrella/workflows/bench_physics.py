@@ -10,6 +10,7 @@ import torch
 
 from .. import library
 from ..core.errors import TerrellaError
+from ..core.numbers import check_seed
 from ..core.policy import Idle
 from ..core.rollouts import rollout
 from ..core.spec import neutral_action
@@ -123,6 +124,7 @@ def bench_physics(
     config = config or BenchPhysicsConfig()
     if min(config.rollouts, config.steps) < 2 or (config.train is not None and not config.train > 0):
         raise TerrellaError("--rollouts and --steps are 2 or more, and --train is above 0 minutes.")
+    check_seed(config.seed)
     if world is not None and config.train is not None:
         raise TerrellaError("a WORLD is given, and --train asks for new ones; leave one of them out.")
     opened = None if world is None else load_named(world, config.device, progress=progress)

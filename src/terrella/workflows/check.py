@@ -12,6 +12,7 @@ import torch
 
 from .. import library
 from ..core.errors import DatasetError, TerrellaError
+from ..core.numbers import check_seed
 from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..data import split
@@ -27,6 +28,7 @@ from .results import folder_name, jsonable, table_lines
 from .score import open_cache
 
 KNOWN = 600  # true rollouts at most, two thirds of them for calibration
+ADVICE = "take fewer --steps, or record longer episodes"
 FEWEST_SEEN, PICTURES_BYTES = (
     150,
     1 << 30,
@@ -89,6 +91,7 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
     bodies, a channel that is missing, a recording that is too short."""
     if min(config.rollouts, config.steps) < 2 or not 0 <= config.coarse <= 1:
         raise TerrellaError("--rollouts and --steps are 2 or more, and --coarse is from 0 to 1.")
+    check_seed(config.seed)
     check_scale(config.metres_per_pixel)
     opened = load_named(world, config.device, progress=progress)
     cache = open_cache(config.data, opened, progress)
@@ -108,11 +111,10 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
     if not chosen or not train:
         raise DatasetError(f"{config.data} has one episode, and a check needs two or more; record more.")
     length = config.steps + (EDGE if pictures else 0)
-    clips = clips_from_cache(cache, chosen, CONTEXT, length, config.rollouts, rng)
+    clips = clips_from_cache(cache, chosen, CONTEXT, length, config.rollouts, rng, advice=ADVICE)
     apart = [number for number in every if number not in chosen] or every
-    known = clips_from_cache(
-        cache, apart, CONTEXT, length, _most_known(opened.spec, length) if pictures else KNOWN, rng
-    )
+    most = _most_known(opened.spec, length) if pictures else KNOWN
+    known = clips_from_cache(cache, apart, CONTEXT, length, most, rng, advice=ADVICE)
     if (count := 2 * len(known) // 3) < 99:
         progress(
             f"{count} true rollouts calibrate the tolerances: up to {1 / (count + 1):.1%} false alarms; 99 give 1%, so "

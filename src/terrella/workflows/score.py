@@ -13,6 +13,7 @@ import numpy as np
 
 from .. import library
 from ..core.errors import DatasetError, TerrellaError
+from ..core.numbers import check_seed
 from ..core.world import World, make_rng
 from ..data import ClipCache, Dataset, check_game, split
 from ..data.training.cache import episodes_with
@@ -166,6 +167,7 @@ def exam_of(
     """The exam, with clips of ground that training saw and of ground that it did not, and its identity. Reading the recordings is
     shown by `report`, or as a stage of its own."""
     world, seed = next(iter(request.arms.values())), request.seed
+    check_seed(seed)
     cache = open_cache(request.data, world, progress, report)
     box: Any = world.spec.card.get("keep_out")  # a part of the map that training never saw
     every = range(len(cache.episodes))

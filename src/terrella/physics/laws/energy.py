@@ -12,11 +12,17 @@ from .law import SINGLE, occasions, with_last
 
 @once
 def energy(motion: Trajectory) -> Tensor:
-    """Kinetic and potential energy of the bodies that nothing drives [T + 1, B], J."""
+    """Kinetic and potential energy of the bodies that nothing drives [T + 1, B], J. The speed of a body on a rod without a velocity
+    channel is that of the middle of a step, and so is its height."""
     moving = motion.present & ~motion.driven
     kinetic = 0.5 * motion.mass * motion.velocity.square().sum(-1)
     turning = 0.5 * (motion.inertia * motion.spin.square()).sum(-1)
-    potential = -motion.mass * (motion.position @ motion.gravity)
+    middle = torch.cat([motion.position[:1] + motion.position[1:2], motion.position[1:] + motion.position[:-1]]) / 2
+    measured = torch.tensor([body.velocity is not None for body in motion.system.bodies])
+    place = (
+        torch.where((motion.tied & ~measured)[:, None], middle, motion.position) if motion.steps else motion.position
+    )
+    potential = -motion.mass * (place @ motion.gravity)
     return ((kinetic + turning + potential) * moving).sum(-1)
 
 
