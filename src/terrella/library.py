@@ -34,7 +34,8 @@ GAMES: dict[str, tuple[tuple[str, ...], str, str]] = {
     ),
     "mujoco:arm": (
         ("mujoco",), "pip install 'terrella[mujoco]'",
-        "an arm; also car (car:road: in a town), drone, ant, humanoid, or any MJCF or URDF: mujoco:FILE.xml",
+        "an arm; also table (an arm with blocks and a drawer, by instructions), car (car:road: in a town), drone, ant, "
+        "humanoid, or any MJCF or URDF: mujoco:FILE.xml",
     ),
     "mujoco:go1": (
         ("mujoco", "mjlab"), "pip install 'terrella[mujoco]' && pip install --no-deps mjlab==1.6.0",

@@ -25,11 +25,12 @@ from .explorer import Explorer
 from .goal_network import KIND, GoalActor
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
+from .teacher import teacher_of
 
 POLICY_NAMES = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, driver or driver:QUALITY (of 0 to 1, where a "
-    "world has a route), the folder of a learned policy, MODULE:NAME or FILE.py:NAME of your own; NAME@0.3 replaces "
-    "three actions in ten by random ones"
+    "world has a route), teacher or teacher:NOISE (where a world has a scripted expert, as mujoco:table), the folder of a "
+    "learned policy, MODULE:NAME or FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by random ones"
 )
 _DEFAULTS = {field.name: field.default for field in fields(SearchConfig)}
 _SETTINGS = {name: type(value) if isinstance(value, str | int) else float for name, value in _DEFAULTS.items()}
@@ -85,15 +86,15 @@ def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None
         return simple[head](spec)
     if head == "constant":
         return Constant(_action(rest, spec))
-    if head == "driver":
-        return driver_of(rest, spec)
+    if head in ("driver", "teacher"):
+        return (driver_of if head == "driver" else teacher_of)(rest, spec)
     if head == "plan":
         return _planner(name, rest, world, cost)
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
         return load_learned_policy(name, spec, world, cost)
-    hint = did_you_mean(name, [*simple, "constant", "plan", "driver"]) or "."
+    hint = did_you_mean(name, [*simple, "constant", "plan", "driver", "teacher"]) or "."
     raise TerrellaError(f"there is no policy '{name}'{hint} There are: {POLICY_NAMES}.")
 
 

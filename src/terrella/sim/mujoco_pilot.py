@@ -3,15 +3,30 @@
 # pyright: reportAttributeAccessIssue=false
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from .mujoco_model import mujoco
-from .mujoco_tasks import RobotLayout, motion, rotate
+from .mujoco_tasks import RobotLayout, Tensors, motion, rotate
 
 VELOCITY, CLIMB, LEVEL, TURN = 2.0, 4.0, (60.0, 14.0), 6.0  # gains, 1/s, 1/s, (1/s², 1/s), 1/s
 MAX_PUSH, MAX_LIFT = 4.0, 6.0  # m/s²; a tilt of 22 degrees
+
+
+class Pilot(Protocol):
+    """Turns actions of its own into the controls of a model. names, units, high: of the axes, which reach from -high to high."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    frame: str
+    high: tuple[float, ...]
+    keys: Mapping[str, list[float]]
+
+    def __call__(self, layout: RobotLayout, state: Tensors, action: torch.Tensor) -> torch.Tensor:
+        """Controls [B, nu] from a state with physics, sensors and the last ctrl, and actions [B, n]."""
+        ...
 
 
 class Multirotor:
@@ -19,7 +34,7 @@ class Multirotor:
     feed-forward). Actions: velocities forward, left and up in m/s in the level frame that turns with the body; turning in rad/s."""
 
     names, units = ("forward", "left", "up", "turn"), ("m/s", "m/s", "m/s", "rad/s")
-    high = (3.0, 3.0, 1.5, 2.0)
+    frame, high = "body", (3.0, 3.0, 1.5, 2.0)
     keys: Mapping[str, list[float]] = {
         "KeyW": [3, 0, 0, 0], "KeyS": [-3, 0, 0, 0], "KeyA": [0, 3, 0, 0], "KeyD": [0, -3, 0, 0],
         "ArrowUp": [0, 0, 1.5, 0], "ArrowDown": [0, 0, -1.5, 0], "ArrowLeft": [0, 0, 0, 2], "ArrowRight": [0, 0, 0, -2],
@@ -36,8 +51,9 @@ class Multirotor:
         self._mass, self._inertia = float(model.body_mass[1]), torch.from_numpy(model.body_inertia[1].copy())
         self._gravity = -float(model.opt.gravity[2])
 
-    def __call__(self, layout: RobotLayout, physics: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Thrusts [B, rotors] in N from physics [B, n] and actions [B, 4]."""
+    def __call__(self, layout: RobotLayout, state: Tensors, action: torch.Tensor) -> torch.Tensor:
+        """Thrusts [B, rotors] in N from the physics [B, n] of a state and actions [B, 4]."""
+        physics = state["physics"]
         velocity, spin, up = motion(layout, physics)
         turn = physics[:, layout.qpos][:, 3:7]
         w, x, y, z = turn.unbind(1)

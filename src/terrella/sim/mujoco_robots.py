@@ -14,10 +14,14 @@ from ..core.errors import TerrellaError
 from ..core.similar import did_you_mean
 from .mujoco_driving import Driving
 from .mujoco_model import FREE, add_floor, mujoco, read
-from .mujoco_pilot import Multirotor
+from .mujoco_pilot import Multirotor, Pilot
 from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracking
 from .mujoco_town import YAWS_DEG, build_town
 from .road_network import road_network
+from .table_hand import TableHand
+from .table_scene import TableArm, table_scene
+from .table_tasks import TableTask
+from .table_words import TASKS
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
@@ -57,12 +61,14 @@ class Robot:
     max_steps: int | None = None
     keys: Mapping[str, list[float]] = field(default_factory=dict)  # as in Spec
     units: tuple[str, ...] = ()  # of actions, where the file does not define them
-    pilot: type[Multirotor] | None = None  # turns actions into controls
+    pilot: Callable[[mujoco.MjModel], Pilot] | None = None  # turns actions into controls
     sky: bool = True  # whether a sky is added with the floor
     cameras: tuple[str, ...] = ()  # that are shown by default, the main one first; default: the file's first
     size: tuple[int, int] = (96, 128)  # height and width of pictures by default
-    # name of a task -> the robot with it, in surroundings by a seed
-    tasks: Mapping[str, Callable[["Robot", int], "Robot"]] = field(default_factory=dict)
+    hides: tuple[str, ...] = ()  # kinds of channels that it does not show: qpos, qvel, contacts, sensor
+    # name of a task -> the robot with it, in a variant: what follows the colon, or ""
+    tasks: Mapping[str, Callable[["Robot", str], "Robot"]] = field(default_factory=dict)
+    variant: str = "SEED"  # of its tasks, for messages: SEED is a whole number, which makes the surroundings
 
     def spec(self, name: str) -> mujoco.MjSpec:
         """The robot's spec with all additions. TerrellaError where the wheel is not installed."""
@@ -84,14 +90,15 @@ class Robot:
         return spec
 
     def with_task(self, text: str) -> "Robot":
-        """The robot with a task by name, or NAME:SEED where it makes its surroundings. TerrellaError for an unknown one."""
-        name, colon, seed = text.partition(":")
-        if name not in self.tasks or colon and not seed.isdecimal():
+        """The robot with a task by name, or NAME:VARIANT. TerrellaError for an unknown one."""
+        name, colon, variant = text.partition(":")
+        known = variant.isdecimal() if self.variant == "SEED" else variant == self.variant
+        if name not in self.tasks or (colon and not known):
             raise TerrellaError(
                 f"this robot has no task '{text}'{did_you_mean(name, self.tasks) or '.'} It has "
-                f"{', '.join(f'{one}, {one}:SEED' for one in self.tasks) or 'none by name'}."
+                f"{', '.join(f'{one}, {one}:{self.variant}' for one in self.tasks) or 'none by name'}."
             )
-        return self.tasks[name](self, int(seed or 0))
+        return self.tasks[name](self, variant)
 
     def rest(self, joint: str) -> float:
         """The position of a joint at rest, rad or m."""
@@ -182,13 +189,29 @@ def _at_table(site: str) -> Callable[[mujoco.MjSpec], None]:
     return add
 
 
-def _on_roads(car: Robot, seed: int) -> Robot:
+def _on_roads(car: Robot, variant: str) -> Robot:
     """A car in the town of this seed."""
+    seed = int(variant or 0)
     roads = road_network(seed)
     return replace(
         car, what="a car on the roads of a made-up town, among cars and walkers, with three cameras", task=Driving(roads),
         adds=lambda spec: build_town(spec, roads, seed), step_s=0.01, control_s=0.1, max_steps=400,
         cameras=tuple(YAWS_DEG), size=(48, 64),
+    )  # fmt: skip
+
+
+def _at_blocks(file: str, what: str, arm: TableArm, servos: Mapping[str, Servo] | None = None) -> Robot:
+    """An arm at the table of sim/table_scene.py."""
+    one = TableTask(closed_m=arm.closed_m)
+
+    def only(*names: str) -> Callable[[Robot, str], Robot]:
+        return lambda robot, variant: replace(robot, task=replace(one, tasks=names, unseen=bool(variant)))
+
+    return Robot(
+        file, f"{what} at a table with three blocks, a cup and a drawer, that gets instructions", one, servos or {}, pose=arm.pose,
+        adds=table_scene(arm), control_s=0.1, max_steps=100, pilot=TableHand, cameras=("front", "wrist"), size=(96, 96),
+        hides=("qpos", "qvel", "contacts", "sensor"), variant="unseen",
+        tasks={"all": only(*TASKS)} | {name: only(name) for name in TASKS},
     )  # fmt: skip
 
 
@@ -275,6 +298,13 @@ ROBOTS: Mapping[str, Robot] = {
     "arm-real": Robot(OWN + "arm_real.xml", "the same arm with another integrator", Hold(), max_steps=150, sky=False),
     "blocks": Robot(
         OWN + "blocks.xml", "an arm that pushes a block and two balls on a table", max_steps=200, sky=False, units=("rad", "rad")
+    ),
+    "table": _at_blocks(
+        OWN + "arm6.xml", "an arm of six axes",
+        TableArm(
+            (-0.4, 0.0), "tip", ("left", "right"),
+            {"joint2": 0.434, "joint3": 1.344, "joint4": 1.364, "left": 0.04, "right": 0.04}, (0.0, 0.04),
+        ),
     ),
     "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),
 }  # fmt: skip

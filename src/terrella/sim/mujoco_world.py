@@ -122,6 +122,7 @@ class MujocoWorld:
         has_lidar = SITE in {site.name for site in spec.sites}
         self._lidar = Lidar(self.file, config.lidar, config.lidar_m) if has_lidar else None
         self._keys, self._units = (dict(robot.keys), robot.units) if robot else ({}, ())
+        self._hides = robot.hides if robot else ()
         self.parameters = parameters_of(self._seen)
         system = system_of(self.file)
         self._system = system.to_json() if system else {}
@@ -225,9 +226,9 @@ class MujocoWorld:
         return self._stepped(state, ctrl)
 
     def _stepped(self, state: State, action: torch.Tensor) -> State:
-        ctrl = action if self._pilot is None else self._pilot(self.layout, state["physics"], action)
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
+            ctrl = action if self._pilot is None else self._pilot(self.layout, state, action)
             result = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
         physics, sensors, warmstart = result
         unstable = ~(physics.isfinite().all(1) & (physics[:, self.layout.qvel].abs() < MAX_SPEED).all(1))
@@ -340,6 +341,7 @@ class MujocoWorld:
         for end in suffix.values():
             channels |= {f"{kind}{end}": spaces_of[kind] for kind in self._kinds} | {f"pose{end}": POSE}
             units |= {f"pose{end}": POSE_UNIT} | ({f"depth{end}": "m"} if "depth" in self._kinds else {})
+        channels = {name: space for name, space in channels.items() if kind_of(name) not in self._hides}
         lenses = {camera: lens(self._seen, camera, self._size, f"pose{end}") for camera, end in suffix.items()}
         cameras = {f"rgb{suffix[camera]}": one for camera, one in lenses.items() if one is not None}
         notes = [f"camera {name} is no pinhole: it has no intrinsics" for name, one in lenses.items() if one is None]
@@ -353,7 +355,7 @@ class MujocoWorld:
             channels=channels,
             observes=(),
             dt_s=self._steps * float(model.opt.timestep),
-            units=units | {"contacts": "N"},
+            units={name: unit for name, unit in (units | {"contacts": "N"}).items() if name in channels},
             # Where the field of view differs between worlds, the Spec has no intrinsics, because one set would be wrong.
             cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
@@ -373,7 +375,7 @@ class MujocoWorld:
                 "action_names": pilot.names,
                 "action_units": pilot.units,
                 "action_mode": "velocity",
-                "action_frame": "body",
+                "action_frame": pilot.frame,
             }
             return {"action": spaces.Box(-high, high), "keys": dict(pilot.keys), "idle": (0.0,) * len(high), **named}
         low, high = (limit.numpy().astype(np.float32) for limit in (layout.low, layout.high))

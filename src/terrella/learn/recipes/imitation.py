@@ -41,9 +41,11 @@ NOT_SEEN = {
     "pose",
     "latent",
     "expert",
+    "truth",
     "action_confidence",
     *ESTIMATES,
 }
+NAMED_ONLY = {"pose", "latent", "expert", "truth", "action_confidence"}  # of these, seen by a policy that names them
 DISCRETE_CHUNK, AXES_CHUNK = 1, 8  # default chunk of actions
 TESTED = 2048  # moments of the final test
 
@@ -127,7 +129,7 @@ def open_demonstrations(
         ]
         sees = tuple(name for name in usual if len(_shape(opened, name) or ()) in (0, 1, 3))
     for name in sees:
-        if name in NOT_SEEN - {"pose", "latent", "expert", "action_confidence"} or _shape(opened, name) is None:
+        if name in NOT_SEEN - NAMED_ONLY or _shape(opened, name) is None:
             known = ", ".join(name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN)
             raise DatasetError(f"a policy cannot see '{name}' of {opened.name}; it has {known or 'nothing to see'}.")
     if not sees:
