@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .workflows.train import TrainResult, adapt, train_latent, train_video
     from .workflows.train_policy import TrainPolicyConfig, TrainPolicyResult, train_policy
     from .workflows.transfer import TransferConfig, TransferResult, transfer
+    from .workflows.verified_practice import VerifiedPracticeConfig, VerifiedPracticeResult, practise_by_rule
 
 _NAMES = {
     ".act.planning": ("SearchConfig",),
@@ -64,6 +65,7 @@ _NAMES = {
     ".workflows.train": ("TrainResult", "adapt", "train_latent", "train_video"),
     ".workflows.train_policy": ("TrainPolicyConfig", "TrainPolicyResult", "train_policy"),
     ".workflows.transfer": ("TransferConfig", "TransferResult", "transfer"),
+    ".workflows.verified_practice": ("VerifiedPracticeConfig", "VerifiedPracticeResult", "practise_by_rule"),
 }
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = [*_HOME, "__version__", "learn"]  # pyright: ignore[reportUnsupportedDunderAll]

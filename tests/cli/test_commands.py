@@ -35,6 +35,9 @@ OPTIONS = {
     "--pictures --policy --port --randomise --seed --size --task --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
+    "practise": "--adapter --device --episodes --fps --goal --group-size --groups --in --json --learning-rate --minutes "
+    "--no-blind --noise --out --randomise --real --reference --reward --save-every-s --seed --size --steps --success --task "
+    "--updates --within",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
     "--momentum --no-curve --out --proposal --randomise --real --replan --rollouts --samples --search "
@@ -78,7 +81,7 @@ def test_the_options_are_as_promised(command, capsys):
 
 
 @pytest.mark.parametrize(
-    "command", ["plan", "play", "evaluate", "train latent", "train policy", "data merge", "space build"]
+    "command", ["plan", "play", "practise", "evaluate", "train latent", "train policy", "data merge", "space build"]
 )
 def test_help_names_values_and_gives_only_defaults_that_are_values(command, capsys):
     shown = help_of(command, capsys)

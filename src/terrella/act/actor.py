@@ -18,6 +18,7 @@ from ..core.files import remedy_of, replacing, write_text
 from ..core.spec import Spec
 from ..core.world import Observation
 from .actor_network import ActorConfig, ActorNetwork, check_seen
+from .choices import Choices
 
 KIND, VERSION = "actor", 1
 POLICY_FILE, WEIGHTS_FILE = "policy.json", "weights.safetensors"
@@ -47,10 +48,18 @@ class Actor:
 
     def act(self, observation: Observation, memory: None, rng: torch.Generator) -> tuple[torch.Tensor, None]:
         """The actions [B, *action.shape], on the network's device."""
+        action, memory, _ = self.explore(observation, memory, rng)
+        return action, memory
+
+    def explore(
+        self, observation: Observation, memory: None, rng: torch.Generator
+    ) -> tuple[torch.Tensor, None, Choices]:
+        """The same, and the choices behind the actions."""
         check_seen(self.network.config, observation)
         distribution = self.network(observation)
         samples = distribution.mode() if self.greedy else distribution.sample(rng)
-        return self.network.config.actions(samples, self.spec), None
+        seen = {name: observation[name] for name in self.sees}
+        return self.network.config.actions(samples, self.spec), None, Choices(seen, samples)
 
     def save(self, folder: str | Path) -> None:
         """Writes the folder, each file atomically; CheckpointError if it cannot be written."""

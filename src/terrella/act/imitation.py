@@ -18,11 +18,12 @@ from ..core.state import State
 from ..core.world import Observation
 from .actor import load_network, write_policy
 from .actor_network import ActorConfig
-from .imitation_network import TEXT, ImitationConfig, ImitationNetwork
+from .choices import Choices
+from .imitation_network import FLOW_STEPS, TEXT, ImitationConfig, ImitationNetwork
 from .sentences import WORDS
 
 KIND, VERSION = "imitation", 1
-_STREAM = 12
+_STREAM, _EXPLORATION = 12, 13
 
 
 @final
@@ -30,12 +31,15 @@ class ImitationActor:
     """A Policy for the actions of `spec`; ActionError or ChannelError if the network is for others.
 
     Its memory holds the features of the last observations and what is left of the chunk. Words of an instruction that it does not
-    know are left out, with a warning that names them.
+    know are left out, with a warning that names them. std: None takes the likeliest choices and buttons; a number draws them, and
+    adds noise of this deviation to axes, in half ranges.
     """
 
-    def __init__(self, network: ImitationNetwork, spec: Spec, card: Mapping[str, Any] | None = None):
+    def __init__(
+        self, network: ImitationNetwork, spec: Spec, card: Mapping[str, Any] | None = None, std: float | None = None
+    ):
         network.config.check(spec)
-        self.network, self.spec, self.card = network, spec, dict(card or {})
+        self.network, self.spec, self.card, self.std = network, spec, dict(card or {}), std
         self._warned: set[str] = set()
 
     @property
@@ -56,9 +60,16 @@ class ImitationActor:
             }
         )
 
-    @torch.no_grad()
     def act(self, observation: Observation, memory: State, rng: torch.Generator) -> tuple[torch.Tensor, State]:
         """The actions [B, *action.shape], on the CPU."""
+        action, after, _ = self.explore(observation, memory, rng)
+        return action, after
+
+    @torch.no_grad()
+    def explore(
+        self, observation: Observation, memory: State, rng: torch.Generator
+    ) -> tuple[torch.Tensor, State, Choices | None]:
+        """The same, and the choices of the chunks; None where all episodes are within a chunk."""
         network, config, batch = self.network, self.network.config, memory.batch
         if missing := [name for name in self.sees if name not in observation]:
             raise ChannelError(f"the policy sees {', '.join(missing)}, which the observation lacks.")
@@ -73,17 +84,26 @@ class ImitationActor:
             kept = history = torch.where(first, features, torch.cat([memory["features"][:, 1:], features], 1))
         seeds = chance.seeds(batch, rng, torch.device("cpu"))
         noise = chance.normal(seeds, (config.chunk * config.action_width,), _STREAM)
-        chunk, taken = memory["chunk"], memory["taken"]
+        chunk, taken, choices = memory["chunk"], memory["taken"], None
         anew = (taken < 0) | (taken >= config.execute)
         if anew.any():
             outcome = None if config.outcome is None else torch.full((batch,), config.outcome, device=device)
-            out = network(history.to(device), memory["acted"].to(device), words, outcome)
-            predicted = network.chunk(out, noise.to(device)).cpu()
-            chunk, taken = torch.where(anew[:, None, None], predicted, chunk), torch.where(anew, 0, taken)
+            seen = {"history": history.to(device), "acted": memory["acted"].to(device), "words": words}
+            seen["outcome"] = outcome
+            out = network(*seen.values())
+            if self.std is None:
+                predicted = network.chunk(out, noise.to(device))
+            else:
+                steps = (FLOW_STEPS, config.chunk * config.action_width)
+                more = self.std * chance.normal(seeds, steps, _EXPLORATION).to(device)
+                drawn = network.draw(out, noise.to(device), more)
+                choices = Choices({name: value for name, value in seen.items() if value is not None}, drawn)
+                predicted = network.chunk_of(drawn)
+            chunk, taken = torch.where(anew[:, None, None], predicted.cpu(), chunk), torch.where(anew, 0, taken)
         encoded = chunk[torch.arange(batch), taken]
         acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
         after = {"features": kept, "acted": acted, "words": spoken, "chunk": chunk, "taken": taken + 1}
-        return config.decode(encoded, self.spec), State(after)
+        return config.decode(encoded, self.spec), State(after), choices
 
     def unknown(self, text: str) -> tuple[str, ...]:
         """The words of an instruction that it does not know."""

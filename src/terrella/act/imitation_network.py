@@ -214,14 +214,37 @@ class ImitationNetwork(nn.Module):
     def chunk(self, out: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
         """The most likely chunk [N, chunk, A] of encoded actions from `forward`; of axes the one to which noise [N, chunk * A]
         flows."""
+        if self.config.actor.mode == AXES:
+            return self.chunk_of(self.draw(out, noise, None))
+        return self._likeliest(out.view(len(out) * self.config.chunk, -1)).view(len(out), self.config.chunk, -1)
+
+    def draw(self, out: torch.Tensor, noise: torch.Tensor, more: torch.Tensor | None) -> torch.Tensor:
+        """A chunk drawn by normal noise [N, chunk * A]. Choices and buttons: encoded, [N, chunk, A]. Axes: all points
+        [N, FLOW_STEPS + 1, chunk * A] of the flow from the noise, with normal noise `more` [N, FLOW_STEPS, chunk * A], if any,
+        shared out over its steps (a stochastic differential equation, as in Flow-GRPO, Liu et al. 2025)."""
         config, count = self.config, len(out)
         if config.actor.mode == AXES:
+            path = [noise]
             for step in range(FLOW_STEPS):
                 time = torch.full((count,), step / FLOW_STEPS, device=out.device)
-                noise = noise + self.flow(noise, time, out) / FLOW_STEPS
-            return noise.view(count, config.chunk, -1).clamp(-1, 1)
+                after = path[-1] + self.flow(path[-1], time, out) / FLOW_STEPS
+                path.append(after if more is None else after + more[:, step] / FLOW_STEPS**0.5)
+            return torch.stack(path, 1)
         logits = out.view(count * config.chunk, -1)
+        uniform = torch.special.ndtr(noise).clamp(1e-6, 1 - 1e-6).view_as(logits)
         if config.actor.mode == BUTTONS:
-            return (logits > 0).float().view(count, config.chunk, -1)
-        parts = [F.one_hot(part.argmax(1), part.shape[1]) for part in logits.split(list(config.actor.counts), 1)]
-        return torch.cat(parts, 1).float().view(count, config.chunk, -1)
+            return (uniform < logits.sigmoid()).float().view(count, config.chunk, -1)
+        return self._likeliest(logits - (-uniform.log()).log()).view(count, config.chunk, -1)
+
+    def chunk_of(self, drawn: torch.Tensor) -> torch.Tensor:
+        """The encoded chunk [N, chunk, A] of what `draw` gives."""
+        if self.config.actor.mode != AXES:
+            return drawn
+        return drawn[:, -1].view(len(drawn), self.config.chunk, -1).clamp(-1, 1)
+
+    def _likeliest(self, logits: torch.Tensor) -> torch.Tensor:
+        """The encoded choices or buttons [N, A] of the highest logits [N, A]."""
+        if self.config.actor.mode == BUTTONS:
+            return (logits > 0).float()
+        parts = [F.one_hot(part.argmax(1), part.shape[1]) for part in logits.split(list(self.config.actor.counts), 1)]
+        return torch.cat(parts, 1).float()

@@ -43,6 +43,7 @@ class Chunk:
     control: list[PlayedEpisode]
     skipped: int
     open_loop_errors: Mapping[str, torch.Tensor]
+    replay: list[PlayedEpisode] = field(default_factory=list)  # the dream, given the actions of the real episodes
 
 
 class LoopedActions:
@@ -78,6 +79,7 @@ class PairedEvaluation:
     steps: int  # of an episode, at most
     seed: int
     compared: tuple[str, ...] = ()  # channels of both whose open-loop error is measured
+    replays: bool = False  # whether the actions of real episodes are replayed in the dream
     _starts: dict[tuple[int, int], EpisodeStarts] = field(default_factory=dict)
 
     def play(self, load: Callable[[], Policy], spec: Spec, number: int, count: int) -> Chunk:
@@ -90,7 +92,8 @@ class PairedEvaluation:
             real = self._play(self.real, self._real_states(starts), policy, seed, spec, kept)
             errors = self._open_loop_errors(starts, real[: min(kept, count)]) if kept else {}
         dream = self._play(self.dream, self._dream_states(starts), load(), seed, spec)
-        return Chunk(real, dream, self._control(starts, dream, seed), starts.skipped, errors)
+        control, replay = self._control(starts, dream, seed), self._replay(starts, real, seed) if self.replays else []
+        return Chunk(real, dream, control, starts.skipped, errors, replay)
 
     def starts(self, number: int, count: int) -> EpisodeStarts:
         if (number, count) not in self._starts:
@@ -164,10 +167,21 @@ class PairedEvaluation:
         do not respond to it; a lone episode gets its own from the middle on."""
         done = [torch.stack(episode.actions) for episode in dream]
         shuffled = [*done[1:], done[0]] if len(done) > 1 else [done[0].roll(len(done[0]) // 2, 0)]
+        return self._dream_of(starts, shuffled, seed)
+
+    def _replay(self, starts: EpisodeStarts, real: Sequence[PlayedEpisode], seed: int) -> list[PlayedEpisode]:
+        """The dream under the actions of the real episodes; what succeeds only after a real episode ended has not succeeded."""
+        episodes = self._dream_of(starts, [torch.stack(episode.actions) for episode in real], seed)
+        for mine, true in zip(episodes, real):
+            mine.success = mine.success and mine.steps <= true.steps
+        return episodes
+
+    def _dream_of(self, starts: EpisodeStarts, actions: Sequence[torch.Tensor], seed: int) -> list[PlayedEpisode]:
+        """The dream under given actions, a sequence for each episode."""
         episodes: list[PlayedEpisode] = []
         settings = PlaySettings(self.steps, self.criterion)
         for state in self._dream_states(starts):
-            policy = LoopedActions(shuffled[len(episodes) : len(episodes) + state.batch])
+            policy = LoopedActions(actions[len(episodes) : len(episodes) + state.batch])
             episodes += play_from(self.dream, state, policy, settings, later(seed, len(episodes)))
         return episodes
 

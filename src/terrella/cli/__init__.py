@@ -36,6 +36,10 @@ COMMANDS = {
     "train video": ("train:video", "learn a world from a recording with pictures"),
     "train latent": ("train:latent", "learn a fast world for agents from pictures, state vectors or both"),
     "train policy": ("train_policy:policy", "train a policy on imagined rollouts of a world, or by imitation"),
+    "practise": (
+        "train_policy:practise",
+        "fine-tune a policy in a world by verified rewards, and prove the gain outside",
+    ),
     "train inverse": ("train_policy:inverse", "learn which actions clips show, from a few labelled episodes"),
     "skills learn": ("skills:learn", "learn a library of skills from a recording and a policy that imitates it"),
     "skills list": ("skills:list_", "list the skills of a library"),

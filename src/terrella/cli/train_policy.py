@@ -1,12 +1,13 @@
-"""The commands `terrella train policy` and `train inverse`."""
+"""The commands `terrella train policy`, `train inverse` and `practise`."""
 
 from typing import Annotated
 
-from tyro.conf import arg
+from tyro.conf import Positional, arg
 
 from ..workflows.inverse import InverseConfig, train_inverse
 from ..workflows.results import command
 from ..workflows.train_policy import TrainPolicyConfig, train_policy
+from ..workflows.verified_practice import VerifiedPracticeConfig, practise_by_rule
 from .say import Json, RecordingName, say, show
 
 
@@ -36,3 +37,25 @@ def inverse(data: RecordingName, config: InverseConfig, json: Json = False) -> N
         command("terrella", "train", "policy", method="imitation", out=out, **{"from": recording}) if recording else ""
     )
     show(trained, json, following)
+
+
+def practise(
+    name: Annotated[str, Positional, arg(metavar="POLICY")],
+    config: VerifiedPracticeConfig,
+    world: Annotated[str, arg(name="in")],
+    json: Json = False,
+) -> None:
+    """Fine-tune a policy inside a world by computed rewards, and print what that gained inside and in the real environment.
+
+    Beside it a blind arm practises without seeing the world, and the actions that failed outside are replayed inside, where they
+    must fail, too. A gain inside without one outside is a warning in the first line. Ctrl-C stops; the same command continues.
+
+    Args:
+        name: The folder of a policy by `train policy`, imitating or not.
+        world: The world to practise in: a name of `terrella list`, the path of a checkpoint or run, or a simulator (gym:ID).
+    """
+    practised = practise_by_rule(name, world, config, progress=say)
+    goal = config.goal[0] if len(config.goal) == 1 else None
+    within = None if config.within == VerifiedPracticeConfig.within else config.within
+    options = {"in": world, "real": config.real, "goal": goal, "within": within, "best_of": (4, 16)}
+    show(practised, json, command("terrella", "evaluate", practised.policy, **options))

@@ -11,7 +11,7 @@ import torch
 from .agreement import LEAST, Agreement, agreement, halves, spearman
 from .statistics import RESAMPLES, Band, Figure, interval_of, mean_interval, wilson
 
-REAL, DREAM, CONTROL = "real", "dream", "control"
+REAL, DREAM, CONTROL, REPLAY = "real", "dream", "control", "replay"
 RETURN, SUCCESS = "return", "success"
 RANDOM = "random"
 PERSISTENCE, UNCERTAINTY = " of the start", "uncertainty"
@@ -81,7 +81,7 @@ def _figures_of(arms: Scores, floor: Scores | None, what: str, seed: int) -> dic
             values = values.double()
             label = arm if name == what else f"{arm} {name}"
             row[label] = wilson(int(values.sum()), len(values)) if name == SUCCESS else interval(values)
-        if floor is not None and arm in floor and arms is not floor and arm != CONTROL:
+        if floor is not None and arm in floor and arms is not floor and arm in (REAL, DREAM):
             row[f"{arm} over random"] = interval(measures[what].double() - floor[arm][what].double())
     if REAL in arms:
         row["gap"] = interval(arms[DREAM][what].double() - arms[REAL][what].double())

@@ -1,15 +1,16 @@
 """`evaluate`: evaluates policies in a world and, where there is one, in the real environment, and measures how far both agree."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from .. import library
+from ..act.best_of import best_of
 from ..act.paired_evaluation import CHUNK, Chunk, PairedEvaluation, check_finite
-from ..act.planning import Cost, FullyObserved, SuccessCriterion, distance_to
+from ..act.planning import Cost, FullyObserved, SuccessCriterion, distance, distance_to
 from ..act.policies_by_name import policy_of
 from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, observed_channels
@@ -35,6 +36,8 @@ from .progress import Progress, silent, stage
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 from .results import folder_name, jsonable, table_lines
 
+BEST_OF = re.compile(r"^best:(\d+):")
+
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -52,6 +55,8 @@ class EvaluateConfig:
     """Distance at which the goal is reached: a share of the range of numbers, or of the full brightness of pictures."""
     success: str | None = None
     """Channel of both worlds that is above 0 when an episode has succeeded, instead of --within."""
+    best_of: tuple[int, ...] = ()
+    """Numbers of plans, as in 4 16: evaluate each policy of a folder also as the best of that many plans, by the world."""
     out: Path | None = None  # Folder for the page and evaluate.json; default: evaluations/ and the world's name.
     device: Device = "auto"
     seed: int = 0  # The same seed gives the same result.
@@ -87,19 +92,20 @@ def evaluate(
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     if not policies:
         raise TerrellaError("name one policy or more: random, idle, plan, constant:VALUE, a folder, or FILE.py:NAME.")
-    names = tuple(dict.fromkeys(policies))
-    study = _open(inside, config, progress)
+    names = tuple(dict.fromkeys((*policies, *_best_of(policies, config.best_of))))
+    study = open_evaluation(inside, config, progress)
     every = names if RANDOM in names else (*names, RANDOM)
     for name in every:  # a policy that does not fit is refused before anything is played
         study.spec.check_channels(observed_channels(study.load(name), study.spec))
     folder = Path(config.out or f"evaluations/{folder_name(inside)}")
-    log = EvaluationLog(folder, _settings(inside, config, study), {name: fingerprint(name) for name in every})
-    _play(study, log, every, config.episodes, progress)
+    marks = {name: fingerprint(BEST_OF.sub("", name)) for name in every}
+    log = EvaluationLog(folder, settings_of(inside, config, study), marks)
+    play_policies(study, log, every, config.episodes, progress)
     return _result(log, names, config, folder)
 
 
 @dataclass(frozen=True)
-class _Study:
+class Evaluation:
     """The worlds of `evaluate`, opened and checked."""
 
     pair: PairedEvaluation
@@ -107,10 +113,23 @@ class _Study:
     cost: Cost | None
 
     def load(self, name: str) -> Policy:
+        """The policy of a name; "best:4:FOLDER" is the best of 4 plans."""
+        if best := BEST_OF.match(name):
+            return best_of(name[best.end() :], int(best[1]), self.pair.dream, self.pair.criterion)
         return policy_of(name, self.spec, self.pair.dream, self.cost)
 
 
-def _settings(world: str, config: EvaluateConfig, study: _Study) -> dict[str, Any]:
+def _best_of(policies: Sequence[str], counts: Sequence[int]) -> list[str]:
+    """The names of the best of some plans of each policy of a folder. TerrellaError where there is none, or a count is below 1."""
+    folders = [name for name in policies if Path(name).is_dir()]
+    if counts and (not folders or min(counts) < 1):
+        raise TerrellaError(
+            "--best-of takes counts from 1 up, and the folder of a policy by `train policy` that draws plans."
+        )
+    return [f"best:{count}:{name}" for name in folders for count in counts]
+
+
+def settings_of(world: str, config: EvaluateConfig, study: Evaluation) -> dict[str, Any]:
     """What must not change for an evaluation to continue."""
     trained = None if library.is_truth(world) else fingerprint(library.folder_of(world))
     settings = {"in": world, "world": trained, "real": config.real, "goal": config.goal, "within": config.within}
@@ -120,7 +139,9 @@ def _settings(world: str, config: EvaluateConfig, study: _Study) -> dict[str, An
     return settings | asdict(config.environment) | {f"{what}'s file": crc_of(file) for what, file in files.items()}
 
 
-def _play(study: _Study, log: EvaluationLog, names: tuple[str, ...], episodes: int, progress: Progress) -> None:
+def play_policies(
+    study: Evaluation, log: EvaluationLog, names: tuple[str, ...], episodes: int, progress: Progress
+) -> None:
     """Plays all policies chunk by chunk, so that all have the same number of episodes whenever it is stopped."""
     chunks = [(number, min(CHUNK, episodes - number * CHUNK)) for number in range(-(-episodes // CHUNK))]
     try:
@@ -149,7 +170,7 @@ def _stopped(log: EvaluationLog, names: tuple[str, ...], episodes: int) -> str:
     return f"stopped: {safe} of {episodes} episodes of each policy are safe in {log.file}; the same command continues.{far}"
 
 
-def _played(study: _Study, name: str, number: int, count: int) -> Chunk:
+def _played(study: Evaluation, name: str, number: int, count: int) -> Chunk:
     try:
         chunk = study.pair.play(partial(study.load, name), study.spec, number, count)
     except TerrellaError as error:
@@ -181,11 +202,15 @@ def labels_of(names: tuple[str, ...]) -> dict[str, str]:
     short = {
         name: re.sub(r"^.*\.py:", "", name) if ".py:" in name else name.rstrip("/").rpartition("/")[2] for name in names
     }
+    short |= {name: best[0] + short[name].rpartition(":")[2] for name in names if (best := BEST_OF.match(name))}
     return {name: one if list(short.values()).count(one) == 1 else name for name, one in short.items()}
 
 
-def _open(name: str, config: EvaluateConfig, progress: Progress) -> _Study:
-    """The worlds by their names, held to each other. TerrellaError for what does not fit."""
+def open_evaluation(
+    name: str, config: EvaluateConfig, progress: Progress, rule: Callable[[Spec], SuccessCriterion] | None = None
+) -> Evaluation:
+    """The worlds by their names, held to each other. TerrellaError for what does not fit. rule: what success is in a world with a
+    spec, in place of that of the settings; real episodes are then replayed in the world."""
     refuse_randomised(name, config.environment)
     if library.is_truth(name):
         dream = _simulator(name, config.environment)
@@ -195,7 +220,10 @@ def _open(name: str, config: EvaluateConfig, progress: Progress) -> _Study:
     if real is not None:
         check_alike(dream.spec, real.spec)
     goal = read_goal(config.goal, dream.spec)
-    criterion = _criterion(config, goal, dream.spec, real)
+    criterion = rule(dream.spec) if rule else _criterion(config, goal, dream.spec, real)
+    _check_shown(criterion, config, real)
+    measured = (real or dream).spec  # one unit of --within: the bounds of a learned world's numbers are not known
+    criterion = replace(criterion, distance_to_goal=lambda _, goal, seen: distance(measured, goal, seen))
     specs = {dream.spec.name: dream.spec} if real is None else {name: dream.spec, str(config.real): real.spec}
     silent_ones = [each for each, spec in specs.items() if "reward" not in spec.channels]
     if silent_ones and not criterion.defined:
@@ -207,8 +235,8 @@ def _open(name: str, config: EvaluateConfig, progress: Progress) -> _Study:
     limit = config.steps or (real or dream).spec.max_episode_steps or dream.spec.max_episode_steps or STEPS
     both = comparable_channels(dream.spec, real.spec) if real else ()
     both = tuple(one for one in both if len(channels[one].shape or ()) == 1 or one in dream.spec.observes)
-    pair = PairedEvaluation(dream, real, criterion, limit, config.seed, both)
-    return _Study(pair, replace(dream.spec, channels=channels), distance_to(dream, goal) if goal else None)
+    pair = PairedEvaluation(dream, real, criterion, limit, config.seed, both, real is not None and rule is not None)
+    return Evaluation(pair, replace(dream.spec, channels=channels), distance_to(dream, goal) if goal else None)
 
 
 def _criterion(config: EvaluateConfig, goal: Mapping[str, Any], dream: Spec, real: World | None) -> SuccessCriterion:
@@ -220,13 +248,17 @@ def _criterion(config: EvaluateConfig, goal: Mapping[str, Any], dream: Spec, rea
                 known = ", ".join(spec.channels)
                 raise PlanningError(f"{spec.name} has no channel '{config.success}'; it has {known}.")
         return SuccessCriterion({}, config.within, config.success)
-    hidden = [name for name in goal if real is not None and name not in real.spec.channels]
+    return SuccessCriterion({name: value[None] for name, value in goal.items()}, config.within, "")
+
+
+def _check_shown(criterion: SuccessCriterion, config: EvaluateConfig, real: World | None) -> None:
+    """PlanningError where the real environment does not show what success is seen by."""
+    hidden = [name for name in criterion.channels if real is not None and name not in real.spec.channels]
     if hidden:
         raise PlanningError(
             f"{config.real} does not show {', '.join(hidden)}, so nobody can tell whether the goal is reached: name a channel that "
             "can with --success."
         )
-    return SuccessCriterion({name: value[None] for name, value in goal.items()}, config.within, "")
 
 
 def _simulator(name: str, environment: EnvironmentConfig) -> World:

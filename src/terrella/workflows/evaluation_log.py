@@ -15,7 +15,7 @@ from ..act.paired_evaluation import CHUNK, Chunk
 from ..act.planning import PlayedEpisode
 from ..core.errors import TerrellaError
 from ..core.files import write_json
-from ..measure.policy_evaluation import CONTROL, DREAM, REAL, RETURN, SUCCESS
+from ..measure.policy_evaluation import CONTROL, DREAM, REAL, REPLAY, RETURN, SUCCESS
 from .results import jsonable
 
 SAVED_EVERY_S = 5.0
@@ -82,7 +82,7 @@ class EvaluationLog:
         new = {"mark": self.fingerprints.get(name), "skipped": {}, "arms": {}, "followed": {}}
         known = self._played.setdefault(name, new)
         known["skipped"][str(first // CHUNK)] = chunk.skipped
-        for arm, episodes in ((REAL, chunk.real), (DREAM, chunk.dream), (CONTROL, chunk.control)):
+        for arm, episodes in _arms_of(chunk).items():
             if episodes:
                 measures = known["arms"].setdefault(arm, {})
                 for measure, values in _measured(episodes).items():
@@ -142,6 +142,10 @@ class EvaluationLog:
         marks = {name: known.get("mark") for name, known in played.items()}
         same = [name for name, mark in marks.items() if mark == self.fingerprints.get(name, mark)]
         self._played = {name: played[name] for name in same}
+
+
+def _arms_of(chunk: Chunk) -> dict[str, list[PlayedEpisode]]:
+    return {REAL: chunk.real, DREAM: chunk.dream, CONTROL: chunk.control, REPLAY: chunk.replay}
 
 
 def _measured(episodes: list[PlayedEpisode]) -> dict[str, list[Any]]:

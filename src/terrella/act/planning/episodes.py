@@ -23,8 +23,8 @@ MAX_SKIPPED = 20  # starts that already succeed, for each episode asked for
 
 @dataclass(frozen=True)
 class SuccessCriterion:
-    """When an episode succeeds: where `channel` is above 0, or else within a distance of the goal. With neither, episodes have
-    a return alone."""
+    """When an episode succeeds: where `channel` is above 0 and it is within a distance of the goal, as far as there are such. With
+    neither, episodes have a return alone."""
 
     goal: Observation = field(default_factory=dict)  # channel -> [1, ...]
     within: float = 0.05  # distance to the goal
@@ -44,7 +44,8 @@ class SuccessCriterion:
         if not self.channel:
             return self.distance(world, seen) <= self.within
         values = seen[self.channel]
-        return values.float().flatten(1).amax(1) > 0 if values.ndim > 1 else values > 0
+        above = values.float().flatten(1).amax(1) > 0 if values.ndim > 1 else values > 0
+        return above.cpu() & (self.distance(world, seen) <= self.within) if self.goal else above
 
     def distance(self, world: World, seen: Observation) -> torch.Tensor:
         """The distance to the goal [B]; NaN without one."""
