@@ -1,5 +1,7 @@
 """What is recorded or converted here opens in the real `lerobot` package, and what that package records opens here.
 
+Its policies act here as they do there, and ours there as here.
+
 `make test-lerobot` makes an environment of its own for that package (tests/lerobot_setup.sh) and names its python in
 TERRELLA_LEROBOT_PYTHON; without it these tests are skipped.
 """
@@ -9,17 +11,35 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
+from safetensors.torch import load, save
+from tests.act.reach import NAME as REACH
 
+import terrella
+from terrella.act.actor import Actor
+from terrella.act.actor_network import ActorConfig, ActorNetwork
+from terrella.act.imitation import ImitationActor
+from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
 from terrella.care import doctor
+from terrella.cli import main
+from terrella.core import chance
+from terrella.core.errors import CheckpointError
+from terrella.core.feature_names import features_of
+from terrella.core.instruction import text_to_bytes
+from terrella.core.spec import TEXT, Spec
+from terrella.core.world import make_rng
 from terrella.data import ClipCache, Dataset
 from terrella.data.source import Readings, Sensor, Source, Take
 from terrella.exchange.convert import open_source, write_source
 from terrella.exchange.formats.lerobot import LeRobotRows
 from terrella.exchange.merging.write import merge_into
 
+ROOT = Path(__file__).parents[2]
 PYTHON = os.environ.get("TERRELLA_LEROBOT_PYTHON")
 pytestmark = pytest.mark.skipif(
     not PYTHON, reason="run `make test-lerobot`: TERRELLA_LEROBOT_PYTHON names no python with lerobot 0.4"
@@ -76,8 +96,100 @@ data.finalize()
 """
 
 
-def _lerobot(script: str, root, rows=()) -> str:
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": ""}
+POLICIES = """
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+inputs = {
+    "observation.images.rgb": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+    "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
+}
+outputs = {"action": PolicyFeature(FeatureType.ACTION, (2,))}
+numbers = {"mean": [1.0, -2.0], "std": [3.0, 0.5], "min": [-4.0, -5.0], "max": [4.0, 4.0]}
+stats = {"observation.state": numbers, "action": {name: [0.1 * x for x in values] for name, values in numbers.items()}}
+levels = {"mean": 0.4, "std": 0.3, "min": 0.0, "max": 1.0}
+stats["observation.images.rgb"] = {name: [[[x]]] * 3 for name, x in levels.items()}
+stats = {key: {name: torch.tensor(x) for name, x in one.items()} for key, one in stats.items()}
+sizes = {
+    "act": dict(chunk_size=6, n_action_steps=4, dim_model=32, n_heads=2, dim_feedforward=64, n_encoder_layers=1,
+                n_vae_encoder_layers=1, latent_dim=8, pretrained_backbone_weights=None),
+    "diffusion": dict(horizon=8, n_action_steps=4, down_dims=(16, 32), diffusion_step_embed_dim=16, n_groups=4,
+                      num_train_timesteps=20, num_inference_steps=5, spatial_softmax_num_keypoints=4, crop_shape=None),
+}
+sizes["ensemble"] = {**sizes["act"], "n_action_steps": 1, "temporal_ensemble_coeff": 0.01}
+for name, settings in sizes.items():
+    torch.manual_seed(0)
+    kind = name.replace("ensemble", "act")
+    config = make_policy_config(kind, input_features=inputs, output_features=outputs, device="cpu", **settings)
+    for part in (get_policy_class(kind)(config), *make_pre_post_processors(config, dataset_stats=stats)):
+        part.save_pretrained(f"{root}/{name}")
+"""
+
+ACT = """
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.utils import preprocess_observation
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+seen = np.load(f"{root}/seen.npz")
+actions = {}
+for name in json.loads(sys.argv[2]):
+    config = PreTrainedConfig.from_pretrained(f"{root}/{name}")
+    policy = get_policy_class(config.type).from_pretrained(f"{root}/{name}")
+    before, after = make_pre_post_processors(config, f"{root}/{name}")
+    policy.reset()
+    actions[name] = []
+    for at, seed in enumerate(seen["seeds"]):
+        given = preprocess_observation({"pixels": {"rgb": seen["rgb"][at]}, "agent_pos": seen["state"][at]})
+        torch.manual_seed(int(seed))
+        with torch.inference_mode():
+            actions[name] += after(policy.select_action(before(given))).tolist()
+print(json.dumps(actions))
+"""
+
+
+OURS = """
+from pathlib import Path
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+register_third_party_plugins()  # finds the package by the prefix of its name
+from lerobot_policy_terrella.__main__ import main
+answers = {}
+for name in json.loads(sys.argv[2]):
+    assert main([f"{root}/{name}", f"{root}/{name}-there"]) is None
+    for place, times in ((f"{root}/{name}-there", 1), (f"{root}/{name}-again", 0)):
+        config = PreTrainedConfig.from_pretrained(place)
+        assert config.type == "terrella"
+        policy = get_policy_class("terrella").from_pretrained(place, strict=True)
+        before, after = make_pre_post_processors(config, place)
+        seen, actions = np.load(f"{root}/{name}.npz"), []
+        batch = {key: torch.from_numpy(value) for key, value in seen.items() if key.startswith("observation")}
+        torch.manual_seed(3)
+        policy.reset()
+        for at in range(len(seen["observation.state"])):
+            task = {"task": [str(one) for one in seen["task"]]} if "task" in seen else {}
+            with torch.inference_mode():
+                given = before({key: value[at] for key, value in batch.items()} | task)
+                actions.append(after(policy.select_action(given)).tolist())
+        with torch.inference_mode():
+            chunk = policy.predict_action_chunk(given)
+        answers[place[len(root) + 1 :]] = {"actions": actions, "chunk": list(chunk.shape)}
+        for part in (policy, before, after) if times else ():
+            part.save_pretrained(f"{root}/{name}-again")
+    given.pop("observation.state")
+    try:
+        policy.select_action(given)
+    except ValueError as error:
+        answers[name] = str(error)
+try:
+    policy.forward(given)
+except NotImplementedError as error:
+    answers["forward"] = str(error)
+answers["other"] = main([f"{root}/other", f"{root}/there"])
+print(json.dumps(answers))
+"""
+
+
+def _lerobot(script: str, root, rows=(), path: str = "") -> str:
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": path}
     command = [str(PYTHON), "-c", HEAD + script, str(root), json.dumps(list(rows))]
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert done.returncode == 0, done.stderr[-3000:]
@@ -194,3 +306,118 @@ def test_several_robots_merged_open_in_lerobot(tmp_path, recording):
     assert facts["rows"]["104"]["action"] == [0.0] * (width - 1) + [0.5]
     assert facts["rows"]["104"]["action_mask"] == [False] * (width - 1) + [True]
     assert facts["rows"]["0"]["embodiment"] != facts["rows"]["104"]["embodiment"]
+
+
+def _reach():
+    return terrella.load(REACH)
+
+
+@pytest.fixture(scope="module")
+def policies(tmp_path_factory):
+    """Tiny untrained policies of LeRobot: ACT, ACT with a temporal ensemble, and diffusion."""
+    root = tmp_path_factory.mktemp("policies")
+    _lerobot(POLICIES, root)
+    return root
+
+
+def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path):
+    world, steps, seen = _reach(), 9, {}
+    state = world.start(1, make_rng(0))
+    for _ in range(steps):  # the same episode for all, under random actions
+        for name, value in world.render(state, ("rgb", "state")).items():
+            seen.setdefault(name, []).append(value)
+        state = world.imagine(state, world.spec.sample_action(1, make_rng(len(seen["rgb"]))), make_rng(0))
+    rng = make_rng(7)
+    seeds = [chance.seeds(1, rng).item() for _ in range(steps)]
+    np.savez(policies / "seen.npz", seeds=seeds, **{name: torch.cat(value).numpy() for name, value in seen.items()})
+    kinds = ("act", "ensemble", "diffusion")
+    theirs = json.loads(_lerobot(ACT, policies, kinds).splitlines()[-1])
+    for kind in kinds:
+        policy, rng = terrella.load_policy(policies / kind, world.spec), make_rng(7)
+        memory, actions = policy.begin(1, rng), []
+        for at in range(steps):
+            action, memory = policy.act({name: value[at] for name, value in seen.items()}, memory, rng)
+            actions.append(action[0].numpy())
+        assert np.abs(np.array(actions) - np.clip(theirs[kind], -1, 1)).max() < 1e-5
+        assert np.ptp(actions, 0).min() > 1e-4 and np.abs(theirs[kind]).min() < 1, "or nothing was compared"
+    words = ["evaluate", str(policies / "act"), str(policies / "diffusion"), "idle", "--in", REACH, "--real", REACH]
+    assert main([*words, "--episodes", "4", "--out", str(tmp_path), "--json"]) == 0
+    evaluated = json.loads(capsys.readouterr().out)
+    assert "3 policies" in evaluated["verdict"][0]
+    for kind in ("act", "diffusion"):
+        assert evaluated["rows"][kind]["real"] == evaluated["rows"][kind]["dream"] != evaluated["rows"]["idle"]["real"]
+
+
+def test_a_policy_of_lerobot_with_statistics_of_another_is_refused(policies):
+    post = "policy_postprocessor_step_0_unnormalizer_processor.safetensors"
+    whole = (policies / "act" / post).read_bytes()
+    stats = load(whole)
+    (policies / "act" / post).write_bytes(save({**stats, "action.std": 2 * stats["action.std"]}))
+    try:
+        with pytest.raises(CheckpointError, match="the statistics of actions differ"):
+            terrella.load_policy(policies / "act", _reach().spec)
+    finally:
+        (policies / "act" / post).write_bytes(whole)
+
+
+PICTURE, TWO = spaces.Box(0, 255, (32, 32, 3), np.uint8), spaces.Box(-1, 1, (2,), np.float32)
+ARM = Spec("arm", spaces.Box(-1, 1, (2,), np.float32), {"rgb": PICTURE, "rgb.wrist": PICTURE, "state": TWO}, (), 0.1)
+GRID = Spec(
+    "grid",
+    spaces.Discrete(3, start=1),
+    {"grid": spaces.Box(0, 9, (5, 5, 2), np.uint8), "observation": spaces.Box(-9, 9, (3,), np.float32), "text": TEXT},
+    (),
+    0.1,
+)
+
+
+def _imitator(folder, spec: Spec, **settings) -> ImitationActor:
+    torch.manual_seed(0)
+    config = ActorConfig.of(spec, tuple(name for name in spec.channels if name != "text"), 16)
+    network = ImitationNetwork(ImitationConfig(config, size=(32, 32), **settings))
+    for weights in network.parameters():  # the last layers begin near 0
+        weights.data += 0.1 * torch.randn_like(weights)
+    ImitationActor.write(network, folder, {})
+    return terrella.load_policy(folder, spec)
+
+
+def test_our_policies_act_in_lerobot_as_they_do_here(tmp_path):
+    _imitator(tmp_path / "arm", ARM, chunk=4, execute=3, own_actions=True)
+    _imitator(tmp_path / "grid", GRID, chunk=2, remember=4, vocabulary=("blue", "go", "red", "to"))
+    Actor(ActorNetwork(ActorConfig.of(ARM, ("state",), 8)), ARM).save(tmp_path / "other")
+    here, rng, texts = {}, np.random.default_rng(0), ["go to red", "go to blue"]
+    for name, spec in (("arm", ARM), ("grid", GRID)):
+        seen = {
+            channel: rng.integers(0, 9, (8, 2, *space.shape)).astype(space.dtype)
+            for channel, space in spec.channels.items()
+            if channel != "text"
+        }
+        there = {channel: value for channel, value in seen.items() if not channel.startswith("rgb")}
+        there = {features_of([channel])[channel]: value for channel, value in there.items()}
+        there["observation.state"] = there.pop("observation", there.get("observation.state"))
+        for channel in ("rgb", "rgb.wrist") if name == "arm" else ():
+            pictures = seen[channel].transpose(0, 1, 4, 2, 3).astype(np.float32) / 255
+            there[features_of([channel])[channel]] = pictures
+        np.savez(tmp_path / f"{name}.npz", **there, **({"task": texts} if name == "grid" else {}))
+        policy, generator, actions = terrella.load_policy(tmp_path / name, spec), make_rng(3), []
+        memory = policy.begin(2, generator)
+        words = {"text": torch.from_numpy(np.stack([text_to_bytes(text) for text in texts]))} if name == "grid" else {}
+        for at in range(8):
+            given = {channel: torch.from_numpy(value[at]) for channel, value in seen.items()}
+            action, memory = policy.act({**given, **words}, memory, generator)
+            actions.append(action.float().reshape(2, -1).tolist())
+        here[name] = np.array(actions)
+    (tmp_path / "site/lerobot_policy_terrella-0.1.0.dist-info").mkdir(parents=True)
+    (tmp_path / "site/lerobot_policy_terrella-0.1.0.dist-info/METADATA").write_text(
+        "Metadata-Version: 2.1\nName: lerobot_policy_terrella\nVersion: 0.1.0\n"
+    )
+    path = os.pathsep.join(map(str, (ROOT / "src", ROOT / "plugins/lerobot_policy_terrella/src", tmp_path / "site")))
+    answers = json.loads(_lerobot(OURS, tmp_path, ("arm", "grid"), path).splitlines()[-1])
+    for name, chunk in (("arm", [2, 4, 2]), ("grid", [2, 2, 1])):
+        for place in ("there", "again"):
+            answer = answers[f"{name}-{place}"]
+            assert np.abs(np.array(answer["actions"]) - here[name]).max() < 1e-5 and answer["chunk"] == chunk
+        assert np.ptp(here[name], 0).max() > 0.1, "or nothing was compared"
+        assert "the policy sees observation.state, which the batch lacks; it holds " in answers[name]
+    assert "terrella train policy --method imitation" in answers["forward"]
+    assert "expected kind 'imitation'" in answers["other"]

@@ -14,6 +14,7 @@ from . import imitation
 from .actor import Actor, policy_folder, read_policy
 from .goal_network import KIND, GoalActor
 from .imitation import ImitationActor
+from .lerobot_policy import LerobotPolicy, lerobot_folder
 from .planning import Cost, GoalBeliefPolicy
 from .skills.actor import SkillActor
 from .skills.library import KIND as SKILLS
@@ -39,8 +40,11 @@ class BeliefPolicy:
 
 
 def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
-    """The learned policy of a folder, for the actions of `spec`. One that sees channels which only `world` has acts through the
-    world; a goal-conditioned one acts towards the goal of `cost`. ActionError, ChannelError or PlanningError if it does not fit."""
+    """The learned policy of a folder, ours or LeRobot's, for the actions of `spec`. One that sees channels which only `world` has
+    acts through the world; a goal-conditioned one acts towards the goal of `cost`. ActionError, ChannelError or PlanningError if
+    it does not fit."""
+    if lerobot_folder(folder):
+        return LerobotPolicy.load(folder, spec)
     kind = read_policy(policy_folder(folder)).get("kind")
     if kind == imitation.KIND:
         return ImitationActor.load(folder, spec)

@@ -23,6 +23,7 @@ from .belief import load_learned_policy
 from .driver import driver_of
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
+from .lerobot_policy import lerobot_folder
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
 from .teacher import teacher_of
@@ -30,7 +31,8 @@ from .teacher import teacher_of
 POLICY_NAMES = (
     "random, idle, explorer, constant:VALUE, plan or plan:samples=16,horizon=12, driver or driver:QUALITY (of 0 to 1, where a "
     "world has a route), teacher or teacher:NOISE (where a world has a scripted expert, as mujoco:table), the folder of a "
-    "learned policy, MODULE:NAME or FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by random ones"
+    "learned policy (ours or LeRobot's), MODULE:NAME or FILE.py:NAME of your own; NAME@0.3 replaces three actions in ten by "
+    "random ones"
 )
 _DEFAULTS = {field.name: field.default for field in fields(SearchConfig)}
 _SETTINGS = {name: type(value) if isinstance(value, str | int) else float for name, value in _DEFAULTS.items()}
@@ -72,7 +74,8 @@ def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | No
 
 def proposal_policy(name: str, world: World) -> Policy:
     """A policy, by name, whose plans a search in `world` evaluates as well; a goal-conditioned one gets the search's goal."""
-    if Path(name).is_dir() and read_policy(policy_folder(name)).get("kind") == KIND:
+    folder = policy_folder(name)
+    if folder.is_dir() and not lerobot_folder(name) and read_policy(folder).get("kind") == KIND:
         return GoalActor.load(name, world.spec, varied=True)
     return policy_of(name, world.spec, world)
 

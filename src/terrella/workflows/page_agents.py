@@ -11,6 +11,7 @@ from .. import library
 from ..act.actor import policy_folder, read_policy
 from ..act.explorer import Explorer
 from ..act.imitation import KIND, ImitationActor
+from ..act.lerobot_policy import lerobot_folder
 from ..act.planning import (
     STRIDE_S,
     Destination,
@@ -89,7 +90,7 @@ class PageAgents:
     def _spec(self) -> Spec:
         """The spec for the policy: where the world gives no instructions to one that imitates, the person may."""
         spec, folder = self.played.spec, policy_folder(self.name)
-        if not folder.is_dir() or read_policy(folder).get("kind") not in (KIND, SKILLS):
+        if lerobot_folder(folder) or not folder.is_dir() or read_policy(folder).get("kind") not in (KIND, SKILLS):
             return spec
         return replace(spec, channels={**spec.channels, TEXT_CHANNEL: TEXT})
 
