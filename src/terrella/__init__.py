@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .workflows.learn import LearnConfig, LearnResult, learn
     from .workflows.lift_space import LiftSpaceConfig
     from .workflows.opening import ControlsConfig, EnvironmentConfig
+    from .workflows.place_job import PlaceJob, PlaceStatus, place_status, resume_place, start_place
     from .workflows.plan import plan
     from .workflows.plan_result import PlanResult
     from .workflows.plan_study import PlanConfig
@@ -57,6 +58,7 @@ _NAMES = {
     ".workflows.learn": ("LearnConfig", "LearnResult"),
     ".workflows.lift_space": ("LiftSpaceConfig",),
     ".workflows.opening": ("ControlsConfig", "EnvironmentConfig"),
+    ".workflows.place_job": ("PlaceJob", "PlaceStatus", "place_status", "resume_place", "start_place"),
     ".workflows.plan": ("plan",),
     ".workflows.plan_result": ("PlanResult",),
     ".workflows.plan_study": ("PlanConfig",),

@@ -66,12 +66,27 @@ class Drawer:
         self.built.append(words)
         return words
 
+    def build_plan(self, plan):
+        self.plan = plan
+        return "hills"
+
+    def lift(self, name, picture):
+        if not picture:
+            raise TerrellaError(f"{name} is empty; give another picture.")
+        self.picture = name, picture
+        return "hills"
+
+    def progress(self):
+        return "light from lamps"
+
 
 @contextlib.contextmanager
-def started(token=None):
+def started(token=None, shelf=None):
     listener, ready, address = open_port("127.0.0.1", 0), threading.Event(), []
     begun = lambda url: (address.append(url), ready.set())  # noqa: E731
-    server = make_server(StartPage(Drawer(), token=token), listener, "127.0.0.1", token, begun, websockets=True)
+    server = make_server(
+        StartPage(shelf or Drawer(), token=token), listener, "127.0.0.1", token, begun, websockets=True
+    )
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
     thread.start()
     assert ready.wait(20)
@@ -124,8 +139,83 @@ def test_what_cannot_be_opened_is_refused_in_one_sentence(body):
         assert answer.status == 422 and answer.text.endswith(".") and "Step inside" in http.get("/").text
 
 
+def test_pictures_and_plans_are_sent_and_faults_are_sentences():
+    with client() as http:
+        assert http.post("/start/picture?name=a.jpg", "pixels").status == 200
+        assert http.post("/start/plan", json.dumps({"rooms": []})).status == 200
+        for path, body, sentence in (
+            ("/start/picture?name=a.jpg", "", "a.jpg is empty"),
+            ("/start/plan", "[]", "reload it"),
+            ("/start/plan", " " * (1 << 18), "bytes"),
+        ):
+            answer = http.post(path, body)
+            assert answer.status == 422 and sentence in answer.text
+        assert http.get("/start/progress").text == "light from lamps"
+        kinds = json.loads(http.get("/start/kinds").text)
+        assert "kitchen" in kinds["rooms"] and kinds["things"]["chair"]["size"] == [0.45, 0.45]
+
+
+def test_a_plan_is_drawn_with_the_mouse_and_built_and_a_picture_dropped(browser, tmp_path):
+    shelf = Drawer()
+    with started("sesame", shelf) as url:
+        context = browser.new_context(viewport={"width": 1000, "height": 700})
+        page = context.new_page()
+        page.goto(url)
+        page.click("#plan")
+        until(page, "!!window.plan?.plan")
+        pixel = """([x, y]) => { const matrix = document.getElementById('board').getScreenCTM();
+            const at = new DOMPoint(x, -y).matrixTransform(matrix); return [at.x, at.y]; }"""
+
+        def drag(*places):
+            page.mouse.move(*page.evaluate(pixel, places[0]))
+            page.mouse.down()
+            for place in places[1:]:
+                page.mouse.move(*page.evaluate(pixel, place))
+            page.mouse.up()
+
+        page.click("#make button")
+        assert page.inner_text("#help") == "Draw a room first."
+        drag([0, 0], [2, 2], [4, 3])
+        drag([4.1, 0.1], [6, 3])  # snaps to the first
+        page.select_option("#label", "sofa")
+        drag([2, 1])
+        page.keyboard.press("Tab")
+        page.click("#turn")
+        drag([2, 1], [2.5, 1.5])
+        assert page.evaluate("plan.plan.rooms.map(({ box }) => box)") == [[0, 0, 4, 3], [4, 0, 6, 3]]
+        assert page.evaluate("plan.plan.things") == [{"label": "sofa", "at": [2.5, 1.5], "facing": "east"}]
+        for _ in range(3):
+            page.click("#undo")
+        assert page.evaluate("[plan.plan.rooms.length, plan.plan.things.length]") == [2, 0]
+        page.reload()  # the plan is kept
+        until(page, "!!window.plan?.plan && plan.plan.rooms.length === 2")
+        page.fill("#style", "rustic")
+        page.click("#make button")
+        page.wait_for_selector("#timeline")
+        assert shelf.plan["words"] == "rustic" and shelf.plan["furnish"] is True and len(shelf.plan["rooms"]) == 2
+        page.goto(url)
+        page.set_input_files("#picture", {"name": "a cat.png", "mimeType": "image/png", "buffer": b"pixels"})
+        page.wait_for_selector("#timeline")
+        assert shelf.picture == ("a cat.png", b"pixels")
+        context.close()
+
+
+def test_a_picture_and_a_plan_become_places_in_folders_of_their_own(tmp_path, monkeypatch):
+    lifted, planned = [], []
+    monkeypatch.setattr(
+        "terrella.workflows.start.lift_space", lambda file, out, config, progress: lifted.append((file.name, out.name))
+    )
+    monkeypatch.setattr("terrella.workflows.start.build_plan", lambda plan, out, progress: planned.append(out.name))
+    shelf = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent)
+    shelf.lift("../../etc/My Cat.png", b"")
+    shelf.lift("..", b"")
+    shelf.build_plan({"words": "rustic, at dusk"})
+    assert lifted == [("My-Cat.png", "my-cat"), ("picture", "picture")] and planned == ["rustic-at-dusk"]
+
+
 def test_a_token_is_asked_for():
     with client("sesame") as http:
+        assert http.get("/start/draw").status == 403 and http.post("/start/picture", "x").status == 403
         assert http.get("/start/cards").status == 403 and http.post("/start/open", "{}").status == 403
         assert http.get("/start/cards?token=sesame").status == 200
 

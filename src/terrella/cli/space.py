@@ -15,11 +15,11 @@ from ..workflows.build_space import (
     import_space,
 )
 from ..workflows.edit_space import EditSpaceConfig, edit_space
+from ..workflows.editable_place import editable_place
 from ..workflows.export_space import ExportSpaceConfig, export_space
 from ..workflows.grow_space import GrowSpaceConfig, grow_space
 from ..workflows.lift_space import LiftSpaceConfig, lift_space
 from ..workflows.results import command
-from ..workflows.splat_places import editable_place
 from .say import Host, Json, PlaceName, Port, RecordingName, Token, opened, say, show
 
 

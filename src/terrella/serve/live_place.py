@@ -12,7 +12,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from .http_server import application, make_server, open_port
-from .place_page import PlacePage, PlaceScene, packed_place
+from .place_page import PlacePage, packed_place
+from .place_scene import PlaceScene
 
 Show = Callable[[Callable[[], PlaceScene], Mapping[str, Any]], None]
 STARTS_S = 20.0

@@ -25,39 +25,23 @@ from starlette.routing import Route
 from ..core.errors import ServeError, TerrellaError
 from ..space.edits import Edit, merges_of
 from ..space.files.compressed import packed_quats
-from ..space.occupancy import Occupancy, Walker, samples
+from ..space.occupancy import Occupancy, samples
 from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
 from .http_server import WEB, application, posted, serve_page, starting_command
 from .place_frames import FrameRenderer
+from .place_scene import PlaceScene
+from .thing_page import PutThings, Spot, read_spot
 
 PAGE = WEB / "place"
 MOST_STARTS = 64
 WHOLE = 150_000  # a place of at most this many Gaussians is sent in one part
 FIRST = 50_000  # of a larger place this many, spread evenly, are sent first; the page shows them while the rest arrives
 LONGEST_EDITS = 1 << 22  # bytes
+LONGEST_WISH = 1 << 12  # bytes of a request to put things
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
-
-
-@dataclass(frozen=True)
-class PlaceScene:
-    """The content of the page of a place."""
-
-    name: str
-    gaussians: Gaussians  # N, before all edits
-    seen: torch.Tensor  # bool [N], which of them were observed
-    objects: torch.Tensor  # int32 [N], the object that each belongs to (0: none; -k: hidden beneath k)
-    starts: torch.Tensor  # float32 [S, 7], poses
-    collider: Occupancy | Solids  # what stops a walker
-    body: Walker
-    pace: Sequence[float]  # as in SplatConfig
-    keep: Sequence[float]  # as in SplatConfig
-    dt_s: float  # duration of a step
-    names: Sequence[str] = ()  # of the objects 1, 2, ...
-    other: Callable[[Edit], PlaceScene] | None = None  # opens the place that an edit merges
-    note: str = ""  # a sentence that the page shows when it opens
 
 
 class PlacePage:
@@ -82,13 +66,14 @@ class PlacePage:
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
         )
 
-    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "") -> bytes:
+    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "", put: str = "") -> bytes:
         """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
         the address of newer states of a place that is being fitted, without editing; frames: the address that renders for browsers
-        that cannot."""
+        that cannot; put: the address that builds things that words name."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
+            "put": put,
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
@@ -101,6 +86,15 @@ class PlacePage:
         }  # fmt: skip
         text = (PAGE / "index.html").read_text("utf-8")
         return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text).encode()
+
+    def add(self, put: PutThings) -> bytes:
+        """Makes things known that the page may merge from now on; their merges and packed Gaussians, as JSON for put.js."""
+        things = []
+        for edit, scene in zip(put.edits, put.scenes):
+            about, packed = _packed_whole(scene)
+            self.merged[_merge_key(edit)] = {**about, "sha256": edit["sha256"]}, packed
+            things.append({"edit": edit, "about": about, "data": packed})
+        return json.dumps({"things": things, "unknown": put.unknown}).encode()
 
     def _opened(self, edit: Edit) -> tuple[dict[str, Any], str]:
         """The place that a merge adds, as the page reads it: its description and its packed Gaussians."""
@@ -229,11 +223,14 @@ class EditablePlace:
     ]  # replaces them with lines of JSON, or raises a TerrellaError, whose sentence the page shows
     beside: PlaceScene | None = None  # a place to compare it with
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
+    put: Callable[[str, Spot], PutThings] | None = (
+        None  # builds what words name, to be put at a spot; may raise a TerrellaError
+    )
 
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; and /frame, which draws for browsers that cannot."""
+    to be saved and those to save; /things, which builds furniture by words; and /frame, which draws for browsers that cannot."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
     frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
 
@@ -249,14 +246,26 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
                 )
             place.save(posted_edits["lines"])
 
-    async def keep(request: Request) -> PlainTextResponse:
+    def build_things(content: bytes) -> bytes:
+        wish = json.loads(content)
+        assert place.put is not None
+        with lock:
+            return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
+
+    async def answer(request: Request, most: int, work: Callable[[bytes], bytes | None], form: str) -> Response:
         try:
-            await run_in_threadpool(save, await posted(request, LONGEST_EDITS))
+            content = await run_in_threadpool(work, await posted(request, most))
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            return PlainTextResponse("edits are lines of JSON; reload the page.", 422)
+            return PlainTextResponse(f"{form}; reload the page.", 422)
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)
-        return PlainTextResponse("")
+        return Response(content or b"", media_type="application/json" if content else "text/plain")
+
+    async def keep(request: Request) -> Response:
+        return await answer(request, LONGEST_EDITS, save, "edits are lines of JSON")
+
+    async def put(request: Request) -> Response:
+        return await answer(request, LONGEST_WISH, build_things, "a thing has words and a spot")
 
     async def draw(request: Request) -> Response:
         try:
@@ -265,7 +274,8 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
             return PlainTextResponse(str(error), 422)
 
     routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
-    html = lambda: page.html(place.edits(), "/edits", frames="/frame")  # noqa: E731
+    routes += [Route("/things", put, methods=["POST"])] if place.put else []
+    html = lambda: page.html(place.edits(), "/edits", frames="/frame", put="/things" if place.put else "")  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
 
 

@@ -4,21 +4,23 @@ import asyncio
 import contextlib
 import json
 import re
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from ..core.errors import ServeError, TerrellaError
-from .http_server import application, posted, serve_page
+from ..space.layout.furniture import KINDS
+from ..space.layout.text_layout import ROOMS
+from .http_server import WEB, application, posted, serve_page
 
-MOST_WORDS = 4096  # bytes of a request
+MOST_WORDS, MOST_PLAN, MOST_PICTURE = 4096, 1 << 17, 32 << 20  # bytes of requests
 _OPEN = re.compile(rb"(^|&)open(=|&|$)")  # in the address of the page that is open
 Build = Callable[[str, str | None], Starlette]  # (host, token) -> the application of a page
 
@@ -50,6 +52,18 @@ class Shelf(Protocol):
         """Builds the place that the words describe; returns its name."""
         ...
 
+    def build_plan(self, plan: Mapping[str, Any]) -> str:
+        """Builds the place of a drawn plan (space/layout/drawn_plan.py); returns its name."""
+        ...
+
+    def lift(self, name: str, picture: bytes) -> str:
+        """Makes a place of a picture, whose file had this name; returns the place's name."""
+        ...
+
+    def progress(self) -> str:
+        """What is being done now, in words; empty if nothing is known. Any thread may call it."""
+        ...
+
 
 class StartPage:
     """An ASGI application: the start page at /, and at /?open the page that was opened last. It shows one at a time, because each
@@ -78,6 +92,11 @@ class StartPage:
             Route("/start/thumbnail", self._thumbnail),
             Route("/start/open", self._opens, methods=["POST"]),
             Route("/start/build", self._builds, methods=["POST"]),
+            Route("/start/plan", self._plans, methods=["POST"]),
+            Route("/start/picture", self._lifts, methods=["POST"]),
+            Route("/start/draw", self._draws),
+            Route("/start/progress", self._progress),
+            Route("/start/kinds", self._kinds),
         ]
 
     @contextlib.asynccontextmanager
@@ -102,23 +121,45 @@ class StartPage:
         except Exception as error:  # a card without a picture is a card all the same
             return PlainTextResponse(str(error), 404)
 
+    async def _kinds(self, request: Request) -> Response:
+        """The rooms and the things of a plan, with their usual sizes in metres."""
+        things = {
+            "door": (0.95, 0.15),
+            "window": (1.5, 0.15),
+            **{name: kind.size[:2] for name, kind in sorted(KINDS.items())},
+        }
+        return JSONResponse({"rooms": {name: {"size": one["size"]} for name, one in ROOMS.items()},
+                             "things": {name: {"size": size} for name, size in things.items()}})  # fmt: skip
+
+    async def _draws(self, request: Request) -> Response:
+        """The page on which a plan is drawn."""
+        return FileResponse(WEB / "start" / "plan.html", media_type="text/html")
+
+    async def _progress(self, request: Request) -> Response:
+        return PlainTextResponse(self._shelf.progress())
+
     async def _opens(self, request: Request) -> Response:
-        return await self._answer(request, "name", self._known)
+        return await self._answer(request, MOST_WORDS, lambda content: self._known(_words(content, "name")))
 
     async def _builds(self, request: Request) -> Response:
-        return await self._answer(request, "words", self._shelf.build)
+        return await self._answer(request, MOST_WORDS, lambda content: self._shelf.build(_words(content, "words")))
 
-    async def _answer(self, request: Request, field: str, name_of: Callable[[str], str]) -> Response:
-        """Opens what a POST names, or what is made of its words; the browser goes to /?open then."""
+    async def _plans(self, request: Request) -> Response:
+        return await self._answer(request, MOST_PLAN, lambda content: self._shelf.build_plan(_object(content)))
+
+    async def _lifts(self, request: Request) -> Response:
+        name = request.query_params.get("name", "")[:200]
+        return await self._answer(request, MOST_PICTURE, lambda content: self._shelf.lift(name, content))
+
+    async def _answer(self, request: Request, most: int, name_of: Callable[[bytes], str]) -> Response:
+        """Opens what a POST names, or what is made of its content; the browser goes to /?open then."""
         try:
-            text = json.loads(await posted(request, MOST_WORDS))[field]
-            if not isinstance(text, str) or not text.strip():
-                raise ServeError("the start page sends a name or words; reload it.")
+            content = await posted(request, most)
             async with self._lock:
-                build = await self._work(lambda: self._shelf.open(name_of(text)))
+                build = await self._work(lambda: self._shelf.open(name_of(content)))
                 await self._show(build(self._host, self._token))
         except (ValueError, KeyError, TypeError, RecursionError):
-            return PlainTextResponse("the start page sends a name or words; reload it.", 422)
+            return PlainTextResponse("the start page sends a name, words, a plan or a picture; reload it.", 422)
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)
         return JSONResponse({})
@@ -138,6 +179,21 @@ class StartPage:
 
     def _work(self, function: Callable, *arguments):
         return asyncio.get_running_loop().run_in_executor(self._worker, function, *arguments)
+
+
+def _object(content: bytes) -> Mapping[str, Any]:
+    """A JSON object; ValueError for other content."""
+    given = json.loads(content)
+    if not isinstance(given, dict):
+        raise ValueError("a request is an object of JSON")
+    return given
+
+
+def _words(content: bytes, field: str) -> str:
+    text = _object(content)[field]
+    if not isinstance(text, str) or not text.strip():
+        raise ServeError("the start page sends a name or words; reload it.")
+    return text
 
 
 def serve_start(

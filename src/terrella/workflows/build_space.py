@@ -19,13 +19,14 @@ from ..serve.live_place import live_page
 from ..space.files import read_scene, replace_whole
 from ..space.files.gltf_scene import GLTF_ENDINGS, GltfScene, read_gltf
 from ..space.layout import BuiltPlace, ParsedText, build, parse_text, read_layout
+from ..space.layout.drawn_plan import layout_of_plan
 from ..space.layout.meshes import of_triangles
 from ..space.occupancy import Walker
 from ..space.raster import Gaussians
 from ..space.raster.move import transform
 from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SolidBoxes, SplatConfig, SplatWorld
-from ..worlds.splat_folder import save_splat, world_of
+from ..worlds.splat_folder import check_free, save_splat, world_of
 from .progress import Progress, silent, stage
 from .splat_places import SpaceResult, page_scene, unheeded
 
@@ -105,7 +106,9 @@ def import_space(file: Path, out: Path, config: ImportSpaceConfig) -> SpaceResul
     return SpaceResult(facts, (f"{len(scene):,} Gaussians; terrella play {out}", *left_out))
 
 
-def build_space(source: str | Path | None, out: Path, config: BuildSpaceConfig) -> SpaceResult:
+def build_space(
+    source: str | Path | None, out: Path, config: BuildSpaceConfig, *, progress: Progress = silent
+) -> SpaceResult:
     """Builds a world of a layout.json, of the triangles of a .glb or .gltf, or of words. The same seed gives the same bytes."""
     layout, text = _layout_or_words(source)
     if (layout is None) == (text is None and config.text is None) or (text and config.text):
@@ -121,7 +124,19 @@ def build_space(source: str | Path | None, out: Path, config: BuildSpaceConfig) 
         rooms = rooms if rooms.name else replace(rooms, name=_file_name(layout))
         rooms = rooms if config.seed is None else replace(rooms, seed=config.seed)
         parsed = ParsedText(rooms, asdict(rooms), (), ())
-    place = build(parsed.layout, config.gaussians)
+    return _built(parsed, out, config, progress)
+
+
+def build_plan(plan: Mapping[str, Any], out: Path, *, progress: Progress = silent) -> SpaceResult:
+    """Builds a world of a floor plan that was drawn: rectangles for rooms, spots for things, words for the style
+    (space/layout/drawn_plan.py). ContractError for a plan that cannot be built."""
+    return _built(layout_of_plan(plan), out, BuildSpaceConfig(), progress)
+
+
+def _built(parsed: ParsedText, out: Path, config: BuildSpaceConfig, progress: Progress) -> SpaceResult:
+    check_free(out)
+    place = build(parsed.layout, config.gaussians, progress)
+    progress("saving the place")
     _save_built(place, parsed, out, config)
     return _built_result(place, parsed, out)
 

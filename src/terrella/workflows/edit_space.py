@@ -6,11 +6,13 @@ from typing import Any
 
 from ..core.errors import CheckpointError, TerrellaError
 from ..library import folder_of
+from ..serve.thing_page import Spot
 from ..space.edits import ACTIONS, Edit, apply_edits
 from ..space.occupancy import extent
 from ..worlds.splat import SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merge_edit, merged_loader, read_edits, write_edits
 from .progress import Progress, silent
+from .put_things import put_things
 from .splat_places import SpaceResult, open_splat
 
 COARSE_M = 0.3  # in wider cells doors are closed
@@ -37,6 +39,8 @@ class EditSpaceConfig:
     delete: bool = False  # Delete the selection.
     merge: str | None = None
     """Add all of this other world of Gaussians. --turn first turns it about its origin, --move then moves it."""
+    put: str | None = None
+    """Put furniture that words name ("a red chair"): --move is where its foot stands, --turn where it looks (0 south, 90 east)."""
     undo: bool = False  # Undo the last edit.
     redo: bool = False  # Redo the edit that was undone last.
     replay: Path | None = None  # Replace the edits by those of this file (one that the page saved).
@@ -49,8 +53,8 @@ class EditSpaceConfig:
     @property
     def actions(self) -> dict[str, Any]:
         """The actions that are given, and their values."""
-        values = {name: getattr(self, name) for name in (*ACTIONS, "merge", "undo", "redo", "replay")}
-        modifiers = ("move", "turn") if self.merge else ()
+        values = {name: getattr(self, name) for name in (*ACTIONS, "merge", "put", "undo", "redo", "replay")}
+        modifiers = ("move", "turn") if self.merge or self.put else ()
         given = {name: value for name, value in values.items() if value is not None and value is not False}
         return {name: value for name, value in given.items() if name not in modifiers}
 
@@ -69,10 +73,10 @@ def edit_space(world: str, config: EditSpaceConfig, *, progress: Progress = sile
         write_edits(folder, edits[:-1], [*undone, edits[-1]])
     else:
         opened = open_splat(world)
-        new = undone[-1] if config.redo else _new_edit(folder, config)
+        new = [undone[-1]] if config.redo else _new_edits(folder, config, progress)
         _check_object(world, opened, config.object)
-        apply_edits(opened.gaussians, [new], opened.objects, merged_loader(folder))  # raises if it cannot be done
-        write_edits(folder, [*edits, new], undone[:-1] if config.redo else ())
+        apply_edits(opened.gaussians, new, opened.objects, merged_loader(folder))  # raises if it cannot be done
+        write_edits(folder, [*edits, *new], undone[:-1] if config.redo else ())
     return _result(world, config, progress)
 
 
@@ -85,7 +89,9 @@ def _check(world: str, config: EditSpaceConfig, edits: list[Edit], undone: list[
     if config.delete and not selection:
         raise TerrellaError("say what to delete: --box, --sphere, --plane or --object.")
     if selection and next(iter(actions)) not in ACTIONS:
-        raise TerrellaError("--merge, --undo, --redo and --replay change the whole place; leave the selection out.")
+        raise TerrellaError(
+            "--merge, --put, --undo, --redo and --replay change the whole place; leave the selection out."
+        )
     if config.undo and not edits or config.redo and not undone:
         raise TerrellaError(f"{world} has no edit to {'undo' if config.undo else 'redo'}.")
 
@@ -99,19 +105,25 @@ def _check_object(world: str, opened: SplatWorld, number: int | None) -> None:
     raise TerrellaError(f"{world} has no object {number}; its objects: {', '.join(listed[:40]) or 'none'}.")
 
 
-def _new_edit(folder: Path, config: EditSpaceConfig) -> Edit:
-    """The edit as its line of JSON."""
+def _new_edits(folder: Path, config: EditSpaceConfig, progress: Progress) -> list[Edit]:
+    """The edits as their lines of JSON: one, or one for each thing that is put."""
+    if config.put is not None:
+        at = config.move or (0.0, 0.0, 0.0)
+        put = put_things(folder, config.put, Spot(at, at[2], degrees=config.turn or 0.0))
+        if put.unknown:
+            progress(f"not understood: {', '.join(put.unknown)}")
+        return list(put.edits)
     if config.merge is not None:
         if Path(config.merge).is_file():
             raise TerrellaError(
                 f"{config.merge} is a file; `terrella space import` or `space build` makes a world of it first."
             )
         open_splat(config.merge)
-        return merge_edit(folder, folder_of(config.merge), config.move or (0.0, 0.0, 0.0), config.turn or 0.0)
+        return [merge_edit(folder, folder_of(config.merge), config.move or (0.0, 0.0, 0.0), config.turn or 0.0)]
     [(action, value)] = config.actions.items()
     parameter, _ = ACTIONS[action]
     edit = {"select": config.selection or {"all": True}, "do": action}
-    return {**edit, parameter: _listed(value)} if parameter else edit
+    return [{**edit, parameter: _listed(value)} if parameter else edit]
 
 
 def _listed(value: Any) -> Any:

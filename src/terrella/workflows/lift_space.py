@@ -22,6 +22,7 @@ from ..space.raster import join
 from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import check_free, save_splat
+from .progress import Progress, silent
 from .splat_places import SpaceResult
 
 MOST_ASPECT = 4.0
@@ -46,7 +47,7 @@ class LiftSpaceConfig:
     eye: float | None = None
 
 
-def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult:
+def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: Progress = silent) -> SpaceResult:
     """Makes a place of one picture and saves it in `out`. Its Gaussians are those of the picture (OBSERVED) and of what lies behind
     edges (INVENTED); metres, z up, the floor at 0, the camera above the origin, looking along x. DatasetError for a file
     that cannot be lifted."""
@@ -55,6 +56,7 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig) -> SpaceResult
     if config.fov is not None and not 20 <= config.fov <= 130 or config.eye is not None and not 0.1 <= config.eye <= 20:
         raise TerrellaError("--fov is from 20 to 130 degrees, and --eye from 0.1 to 20 metres.")
     check_free(out)
+    progress("estimating depth and what lies behind edges")
     notes, lifter = _frames(picture), load_lifter()
     if config.panorama and config.fov is not None:
         raise TerrellaError("--fov is for pictures of one direction, --panorama for those of all; leave one out.")

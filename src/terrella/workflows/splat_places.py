@@ -5,24 +5,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import ContractError, TerrellaError
+from ..core.errors import TerrellaError
 from ..library import folder_of
-from ..serve.place_page import EditablePlace, PlaceScene
+from ..serve.place_scene import PlaceScene
 from ..space.edits import Edit
 from ..space.files import read_scene
 from ..space.solids import Solids
 from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
-from ..worlds.splat_folder import (
-    checked_edits,
-    load_source,
-    merge_edit,
-    merged_loader,
-    read_edits,
-    world_of,
-    write_edits,
-)
+from ..worlds.splat_folder import load_source, merged_loader, world_of
 
 
 @dataclass(frozen=True)
@@ -84,26 +76,3 @@ def compared_scene(name: str) -> PlaceScene:
     """The place that a page is compared with: a world of Gaussians after its edits, or a file in its usual axes."""
     file = Path(name)
     return page_scene(world_of(read_scene(file), file.name, {}, SplatConfig()) if file.is_file() else open_splat(name))
-
-
-def editable_place(world: str, beside: str | None = None) -> EditablePlace:
-    """A world of Gaussians as a page edits it: edits that are saved on the page are saved in the world's folder.
-
-    beside: another world, or a file of Gaussians, to compare it with. A world can be merged on the page, too.
-    """
-    folder = folder_of(world)
-    return EditablePlace(
-        unedited_scene(world),
-        lambda: read_edits(folder),
-        lambda text: write_edits(folder, checked_edits(folder, text)),
-        None if beside is None else compared_scene(beside),
-        None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
-    )
-
-
-def _merge_of(folder: Path, other: str) -> Edit | None:
-    """The edit that merges a world; None if one of the two contains the other."""
-    try:
-        return merge_edit(folder, folder_of(other))
-    except ContractError:
-        return None

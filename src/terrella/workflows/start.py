@@ -3,8 +3,10 @@
 import io
 import json
 import re
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -18,11 +20,12 @@ from ..serve.place_page import build_place
 from ..serve.server import Sessions, build_app
 from ..serve.start_page import Build, StartCard, serve_start
 from ..serve.viewer import build_viewer
-from .build_space import BuildSpaceConfig, amount, build_space
+from .build_space import BuildSpaceConfig, amount, build_plan, build_space
+from .editable_place import editable_place
+from .lift_space import LiftSpaceConfig, lift_space
 from .opening import ControlsConfig
 from .play import PlayConfig, first_seed, prepared
 from .progress import Progress, silent
-from .splat_places import editable_place
 
 DEPTH = 3  # folders below the working directory that are searched
 MOST_FOLDERS = 2000  # that are searched
@@ -50,6 +53,7 @@ class FolderShelf:
             page,
             progress,
         )
+        self._doing = ""
 
     def cards(self) -> list[StartCard]:
         cards = []
@@ -85,11 +89,34 @@ class FolderShelf:
         return lambda host, token: build_app(sessions, host, token)
 
     def build(self, words: str) -> str:
+        return self._made(words, lambda out: build_space(None, out, BuildSpaceConfig(text=words), progress=self._note))
+
+    def build_plan(self, plan: Mapping[str, Any]) -> str:
+        words = str(plan.get("words") or "a drawn plan")
+        return self._made(words, lambda out: build_plan(plan, out, progress=self._note))
+
+    def lift(self, name: str, picture: bytes) -> str:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / (re.sub(r"[^\w.-]+", "-", Path(name).name).lstrip(".-") or "picture")
+            file.write_bytes(picture)
+            return self._made(file.stem, lambda out: lift_space(file, out, LiftSpaceConfig(), progress=self._note))
+
+    def progress(self) -> str:
+        return self._doing
+
+    def _note(self, text: str) -> None:
+        self._doing = text
+
+    def _made(self, words: str, make: Callable[[Path], object]) -> str:
+        """Makes a place in a free folder that is named after words."""
         stem = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")
         stem = (stem if len(stem) <= LONGEST_NAME else stem[:LONGEST_NAME].rpartition("-")[0]) or "place"
         names = (f"{stem}-{number}" if number > 1 else stem for number in range(1, 1000))
         out = next(out for name in names if not (out := self._folder / "places" / name).exists())
-        build_space(None, out, BuildSpaceConfig(text=words))
+        try:
+            make(out)
+        finally:
+            self._note("")
         return str(out)
 
     def _section(self, name: str) -> str:

@@ -1,6 +1,7 @@
 """Blocks as flat Gaussians with light baked in: a fine picture of every visible side, cut into cells."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,8 +46,9 @@ class BuiltPlace:
     starts: torch.Tensor  # float32 [R, 7], a pose in each room, at the height of its floor
 
 
-def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
-    """Builds a layout with about `count` Gaussians. The same layout gives the same place. ContractError if parts do not fit."""
+def build(plan: RoomLayout, count: int = 120_000, report: Callable[[str], None] = lambda text: None) -> BuiltPlace:
+    """Builds a layout with about `count` Gaussians. The same layout gives the same place. ContractError if parts do not fit.
+    `report` gets what is being done, in words."""
     blocks = blocks_of(plan)
     boxes, bodies, objects = blocks.boxes, blocks.bodies, np.asarray(blocks.objects, np.int32)
     daylight = daylight_of(plan.time)
@@ -55,16 +57,20 @@ def build(plan: RoomLayout, count: int = 120_000) -> BuiltPlace:
     texels = grid(boxes, np.full(len(boxes), _coarse(plan, TEXEL_M)))
     kinds = _kinds(texels, blocks, bodies)
     bare = kinds == 1
+    report("light from lamps, windows and walls")
     light = light_map(scene, texels, bare, len(plan.rooms), plan.seed)
     used = np.zeros(6 * len(boxes), np.bool_)
     used[texels.faces[kinds > 0]] = True
     drawn = np.array([look.material != "glass" and shape.drawn for look, shape in zip(blocks.looks, blocks.shapes)])
     used &= np.repeat(drawn, 6)
+    report("shadows where surfaces meet")
     close = contact(scene, used, _coarse(plan, CONTACT_M))
     fine = _fine(boxes, objects, texels, kinds, used, count)
     kinds = _kinds(fine, blocks, bodies)
+    report("textures and sunlight")
     picture, exposure = _picture(plan, blocks, scene, shapes, fine, kinds, (texels, light), close)
     edges = _edges(fine, kinds, _opaque(blocks), shapes)
+    report("Gaussians on all surfaces")
     cells = cells_of(fine, picture, kinds, edges, (_weights(blocks, objects), _round(boxes, shapes)), count)
     owner = objects[cells.faces // 6]
     owner = np.where(cells.kinds > 1, 1 - cells.kinds, owner).astype(np.int32)

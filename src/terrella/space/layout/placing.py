@@ -38,6 +38,7 @@ def furnish_room(layout: dict[str, Any], number: int, requests: Sequence[Furnitu
     """Adds the requested things to room `number` of a layout, and a door to the next room. Returns those without a place, such as
     "2 chair"."""
     room, following = _Room(layout, number, random.Random(1000 * seed + number)), number + 1 < len(layout["rooms"])
+    room.keep_clear(number > 0)
     lost = Counter({one.label: 0 for one in requests})
     for one in requests:
         lost[one.label] += max(one.count - MOST_EACH, 0)
@@ -46,6 +47,16 @@ def furnish_room(layout: dict[str, Any], number: int, requests: Sequence[Furnitu
     ):
         lost[label] += count
     return [f"{count} {label}" for label, count in lost.items() if count]
+
+
+def furnish_drawn(
+    layout: dict[str, Any], number: int, requests: Sequence[FurnitureRequest], entries: Sequence[tuple[str, float]]
+) -> None:
+    """Adds the requested things, as far as there is place, to room `number` of a layout whose doors and windows are there. entries:
+    where one comes in, the wall and the metres along it."""
+    room = _Room(layout, number, random.Random(1000 * layout["seed"] + number))
+    room.clear += [room._before(side, at - 0.6, at + 0.6, CLEAR_M + 0.1) for side, at in entries]
+    room.fill(requests, False, False)
 
 
 def across_and_up(scale: tuple[float, float, float]) -> tuple[float, float]:
@@ -65,13 +76,13 @@ class _Room:
         self.hung: list[Rect] = []  # what hangs on walls
         self.tables: list[tuple[Rect, list[tuple[float, float, str]]]] = []
 
+    def keep_clear(self, entered: bool) -> None:
+        """Keeps free where one comes in from the west, or where one begins."""
+        middle, deep, half = (self.y0 + self.y1) / 2, *((CLEAR_M + 0.2, 0.6) if entered else (1.4, 0.5))
+        self.clear.append((self.x0, middle - half, self.x0 + deep, middle + half))
+
     def fill(self, requests: Sequence[FurnitureRequest], entered: bool, following: bool) -> list[tuple[str, int]]:
         """Openings first, then the largest things. Returns how many of which have no place."""
-        middle = (self.y0 + self.y1) / 2
-        if entered:
-            self.clear.append((self.x0, middle - 0.6, self.x0 + CLEAR_M + 0.2, middle + 0.6))
-        else:
-            self.clear.append((self.x0, middle - 0.5, self.x0 + 1.4, middle + 0.5))  # where one begins
         lost = self._openings([one for one in requests if one.label in ("door", "window")], entered, following)
         order = {"stairs": 0, "pillar": 1, "middle": 2, "wall": 3, "corner": 4, "hung": 5, "any": 6, "ceiling": 7}
         rest = [one for one in requests if one.label not in ("door", "window")]

@@ -6,6 +6,7 @@ Rooms follow one another to the east, joined by doors. Unknown words are reporte
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,6 +76,7 @@ _SIDELESS = {
     "stairs": ("east", "west", "middle", "corner"),
 }
 _NOUNS = {*ROOMS, *_THINGS, *_SURFACES}
+_FILLERS = re.compile(r"\b(put|place|add|set|here|there|please|right|just)\b")  # "put a chair right here"
 MOST_ROOMS = 12
 MOST_COUNT = 10_000
 
@@ -111,7 +113,7 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     layout: dict[str, Any] = {
         "name": name if len(name) <= 60 else f"{name[:58].rsplit(' ', 1)[0].rstrip(' ,')}...",
         "seed": seed,
-        **_atmosphere(reader),
+        **_atmosphere(reader, [room.kind for room in reader.rooms]),
         "rooms": [],
         "doors": [],
         "windows": [],
@@ -142,9 +144,45 @@ def parse_text(text: str, seed: int = 0) -> ParsedText:
     return ParsedText(read_layout(layout), layout, unknown, tuple(left_out), name)
 
 
-def _atmosphere(reader: "_Reader") -> dict[str, str]:
-    """The style and the time of a text."""
-    kinds = [room.kind for room in reader.rooms]
+def furniture_in(text: str) -> tuple[list[FurnitureRequest], tuple[str, ...], str]:
+    """The furniture that a text names ("two red chairs here"), the words without effect, and the style, "" for none."""
+    reader = _Reader(_FILLERS.sub(" ", text.lower()))
+    things = [one for room in reader.rooms for one in room.things]
+    unknown = reader.unknown + [room.kind for room in reader.rooms if not reader.implied]
+    unknown += [one.label for one in things if one.label in _SIDELESS]
+    unknown += [word for word in reader.words if SIDES.get(word) in {one.side for one in things}]
+    return [one for one in things if one.label not in _SIDELESS], tuple(dict.fromkeys(unknown)), reader.style
+
+
+@dataclass(frozen=True)
+class Decoration:
+    """What words give to rooms that are there already."""
+
+    atmosphere: dict[str, str]  # style and time
+    looks: tuple[dict[str, Any], ...]  # of each room: height in metres, floor, walls, ceiling, lamps
+    furniture: tuple[list[FurnitureRequest], ...]  # the usual of each room
+    unknown: tuple[str, ...]  # words without effect
+
+
+def decorate(text: str, kinds: Sequence[str]) -> Decoration:
+    """What a text ("scandinavian, at sunset, brick walls") gives to rooms of these kinds (ROOMS); "room" is all of them."""
+    reader = _Reader(text)
+    atmosphere, looks, furniture = _atmosphere(reader, kinds), [], []
+    for kind in kinds:
+        same = [room for room in reader.rooms if room.kind in (kind, "room")]
+        room = _RoomText(kind, looks=dict(same[-1].looks) if same else {}, without=same[-1].without if same else set())
+        about = {**ROOMS[kind], **_looks(room, atmosphere["style"])}
+        about["height"] = about.pop("size")[2]
+        _furnish(room, atmosphere["style"], reader.moods, about)
+        looks.append(about)
+        furniture.append([one for one in room.things if one.label not in _SIDELESS])
+    idle = [room.kind for room in reader.rooms if room.kind not in (*kinds, "room")]
+    idle += [one.label for room in reader.rooms for one in room.things]
+    return Decoration(atmosphere, tuple(looks), tuple(furniture), tuple(dict.fromkeys([*reader.unknown, *idle])))
+
+
+def _atmosphere(reader: "_Reader", kinds: Sequence[str]) -> dict[str, str]:
+    """The style and the time of a text about rooms of some kinds."""
     style = reader.style or next((ALWAYS[kind] for kind in kinds if kind in ALWAYS), "plain")
     return {"style": style, "time": reader.time or ("night" if set(kinds) == {"dungeon"} else "day")}
 

@@ -9,6 +9,8 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
+import { Orbit } from './orbit.js';
+import { spotAt } from './put.js';
 import { linkBack, reach } from './reach.js';
 import { Remote } from './remote.js';
 import { decoded, inflate, joined, Reader, unpackScene } from './scene.js';
@@ -66,15 +68,16 @@ if (ready) run(ready);
 
 function run({ drawing, source, story, solid: first }) {
   let solid = first, made = '';
-  const walker = new Walker(world), map = new MiniMap($('minimap').querySelector('canvas'));
+  const walker = new Walker(world), orbit = new Orbit(walker), map = new MiniMap($('minimap').querySelector('canvas'));
   const sorter = new Sorter(({ order, coarse, all, view }) => { drawing.order(order, coarse); Object.assign(seen, { visible: all, looked: view.looks }); redraw(); });
   const hands = new Hands(canvas, $('stick'), {
-    moved: wake, tool: (name, event) => editor.open && editor.selecting.handle(name, event),
-    look: (dx, dy) => { walker.look((2 * lens().wide * dx) / innerWidth, (2 * lens().tall * dy) / innerHeight); wake(); },
+    moved: walks, tool: (name, event) => editor.open && editor.selecting.handle(name, event), look,
+    key: (event) => editor.open && editor.gizmo.key(event), still: () => orbit.on, zoom: (factor) => { if (orbit.on) { orbit.zoom(factor); redraw(); } },
   });
   const compare = new Compare(redraw);
   const editor = new Editor(story, drawing, {
-    changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep,
+    changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look,
+    solid: () => solid, body: world.body, put: world.put, command: world.command,
   });
 
   /** A scene is drawn, and what is solid is read off it. */
@@ -122,6 +125,25 @@ function run({ drawing, source, story, solid: first }) {
     return { wide, tall: wide / aspect };
   }
 
+  /** Who walks leaves the orbit. */
+  function walks() {
+    if (orbit.on && hands.wish.some(Boolean)) turnAround();
+    wake();
+  }
+
+  function look(dx, dy) {
+    const across = (2 * lens().wide * dx) / innerWidth, up = (2 * lens().tall * dy) / innerHeight;
+    if (orbit.on) orbit.turn(-2 * across, -2 * up); else walker.look(across, up);
+    if (orbit.on) redraw(); else wake();
+  }
+
+  /** Begins to turn around what is selected, or what is ahead; or ends it. */
+  function turnAround() {
+    const target = orbit.on ? null : editor.gizmo.bounds ? editor.gizmo.middle : spotAt(story.scene, solid, world.body, walker.eye.place, axes(walker.eye).ahead).at;
+    orbit.around(target);
+    flip('orbit', orbit.on);
+  }
+
   function redraw() { seen.dirty = true; wake(); }
 
   function wake() {
@@ -164,7 +186,9 @@ function run({ drawing, source, story, solid: first }) {
   /** The eye, turned no farther than the last order reaches to the sides: beyond it nothing is drawn yet. */
   function shownEye() {
     const { place, heading, pitch } = walker.eye, near = (at, middle) => Math.max(middle - LEAD, Math.min(middle + LEAD, at));
-    return seen.looked && !drawing.remote ? { place, heading: near(heading, seen.looked[0]), pitch: near(pitch, seen.looked[1]) } : walker.eye;
+    if (!seen.looked || drawing.remote) return walker.eye;
+    const shown = [near(heading, seen.looked[0]), near(pitch, seen.looked[1])];
+    return orbit.on ? orbit.eye(...shown) : { place, heading: shown[0], pitch: shown[1] };
   }
 
   function paint() {
@@ -175,6 +199,7 @@ function run({ drawing, source, story, solid: first }) {
     const eye = shownEye(), view = { ...matrices(eye, lens()), eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
     drawing.paint(view, part, editor.wires);
     compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
+    editor.gizmo.place();
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
     seen.painted += 1;
     seen.times.push(performance.now());
@@ -189,23 +214,25 @@ function run({ drawing, source, story, solid: first }) {
     $('fly').setAttribute('aria-pressed', walker.flying);
   }
 
-  const home = () => { walker.start(0); redraw(); };
+  const home = () => { if (orbit.on) turnAround(); walker.start(0); redraw(); };
   const fly = () => { walker.flying = !walker.flying; wake(); figures(); };
   const flip = (id, shown) => { $(id).setAttribute('aria-pressed', shown); redraw(); };
   const tint = () => { drawing.tint = 1 - drawing.tint; $('legend').hidden = !drawing.tint; flip('tint', !!drawing.tint); };
   const showMap = () => { $('minimap').hidden = !$('minimap').hidden; flip('map-open', !$('minimap').hidden); };
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
-  const does = { home, fly, edit: () => editor.toggle(), tint, compared: contrast, 'map-open': showMap, full };
+  const putHere = () => { if (world.put && !drawing.remote) { if (!editor.open) editor.toggle(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
+  const does = { home, fly, orbit: turnAround, edit: () => editor.toggle(), tint, compared: contrast, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
-    else if (!event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey && shortcuts[event.code]) shortcuts[event.code]();
+    else if (!event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey && shortcuts[event.code]) { event.preventDefault(); shortcuts[event.code](); }
   });
   canvas.addEventListener('wheel', (event) => {
     event.preventDefault();
-    if (!(editor.open && editor.selecting.wheel(editor.chosen, event.deltaY < 0 ? 1.1 : 1 / 1.1))) walker.look(-event.deltaX / 600, -event.deltaY / 1200);
+    if (orbit.on) orbit.zoom(Math.exp(-event.deltaY / 900));
+    else if (!(editor.open && editor.selecting.wheel(editor.chosen, event.deltaY < 0 ? 1.1 : 1 / 1.1))) walker.look(-event.deltaX / 600, -event.deltaY / 1200);
     redraw();
   }, { passive: false });
   addEventListener('resize', () => { map.layer = null; redraw(); });
@@ -239,7 +266,7 @@ function run({ drawing, source, story, solid: first }) {
     }).catch((error) => toast(error.message));
   }
   if (drawing.remote) {
-    for (const id of ['edit', 'tint', 'compared']) $(id).hidden = true;
+    for (const id of ['edit', 'tint', 'compared', 'orbit']) $(id).hidden = true;
     toast(world.watch ? 'This browser has no WebGL2; watch the fit in another one.' : 'This browser has no WebGL2, so the server draws. You can walk; editing needs WebGL2.');
   }
   if (world.watch) {
@@ -250,7 +277,7 @@ function run({ drawing, source, story, solid: first }) {
 
   // the state of the page, for scripts
   window.terrella = {
-    story, editor, drawing, walker, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
+    story, editor, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
     get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {

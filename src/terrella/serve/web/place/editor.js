@@ -1,26 +1,36 @@
 // The editing panel: the selection, the actions, and the edits so far.
 
-import { describe, middleOf, select } from './edits.js';
+import { describe, endsOf, middleOf, select } from './edits.js';
+import { Gizmo } from './gizmo.js';
+import { Put } from './put.js';
 import { Selecting } from './selecting.js';
-import { wiresOf } from './wires.js';
+import { marker, wiresOf } from './wires.js';
 
 const $ = (id) => document.getElementById(id);
 const NAMES = { box: ['x', 'y', 'z', 'to x', 'to y', 'to z'], sphere: ['x', 'y', 'z', 'r'], plane: ['a', 'b', 'c', 'd'] };
 const SAID = {
   box: 'Press on a point and drag: a box around it. The wheel changes its size.', sphere: 'Press on a point and drag: a sphere around it. The wheel changes its size.',
+  put: 'Press where it shall stand, and say what: "a red chair", "two small plants".',
   brush: 'Paint over a part. The wheel changes the size of the brush; Shift adds to the selection.', object: 'Click an object.',
   plane: 'Press on a point to select all that is higher. In general: a x + b y + c z > d.',
 };
 const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 
 export class Editor {
-  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), say(text), keep(lines) -> promise. */
+  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), solid(), body, say(text), keep(lines) -> promise, look(dx, dy); put and
+   * command: the address that builds things, and what starts its server. */
   constructor(story, drawing, on) {
     Object.assign(this, { story, drawing, on, chosen: null, mask: null, open: false });
     this.selecting = new Selecting({
       scene: () => story.scene, eye: on.eye, lens: on.lens, mask: () => this.mask, choose: (chosen) => this.choose(chosen), say: on.say,
       dabs: () => [...(this.chosen?.brush ?? [])], preview: (shift) => this.preview({ move: shift }), move: (by) => this.act({ do: 'move', by }),
+      spot: (way) => { this.put.choose(way); on.redraw(); }, write: () => $('put-words').focus(), look: on.look,
     });
+    this.gizmo = new Gizmo($('gizmo'), { eye: on.eye, lens: on.lens, preview: (change) => this.preview(change), act: (action) => this.act(action) });
+    this.put = new Put($('putting'), {
+      scene: () => story.scene, solid: on.solid, eye: on.eye, body: on.body, address: on.put, command: on.command, say: on.say, put: (edits, scenes) => this.merge(edits, scenes),
+    });
+    document.querySelector('[data-tool=put]').hidden = !on.put;
     document.querySelectorAll('[data-tool]').forEach((button) => { button.onclick = () => this.take(button.dataset.tool); });
     document.querySelectorAll('[data-do]').forEach((button) => { button.onclick = () => this.act(this.action(button.dataset.do)); });
     document.querySelectorAll('[data-preview]').forEach((fields) => {
@@ -44,10 +54,27 @@ export class Editor {
     $('edit').setAttribute('aria-pressed', this.open);
     $('place').classList.toggle('editing', this.open);
     this.on.marked(this.open ? this.mask : null);
+    this.hold();
+  }
+
+  /** Adds what was built by words, and selects the last of it. */
+  merge(edits, scenes) {
+    for (const [sha256, scene] of scenes) this.story.others.set(sha256, scene);
+    this.change(() => edits.forEach((edit) => this.story.add(edit)));
+    this.take('object');
+    this.choose({ object: this.story.scene.objects.reduce((most, number) => Math.max(most, number), 0) });
+  }
+
+  /** The handles around what is selected. */
+  hold() {
+    this.gizmo.around(this.open && this.mask && !this.drawing.remote && !('all' in this.chosen || 'plane' in this.chosen) ? endsOf(this.story.scene, this.mask) : null);
   }
 
   take(tool) {
     this.selecting.tool = tool;
+    this.put.spot = null;
+    $('putting').hidden = tool !== 'put';
+    this.on.redraw();
     document.querySelectorAll('[data-tool]').forEach((button) => { button.setAttribute('role', 'radio'); button.setAttribute('aria-checked', button.dataset.tool === tool); });
     $('tool-said').textContent = SAID[tool];
   }
@@ -55,6 +82,7 @@ export class Editor {
   choose(chosen) {
     const mask = chosen && select(this.story.scene, chosen);
     Object.assign(this, { chosen, mask: mask?.count ? mask : null });
+    this.hold();
     this.preview({});
     this.on.marked(this.mask);
     this.show();
@@ -118,7 +146,7 @@ export class Editor {
     $('open').value = '';
   }
 
-  get wires() { return this.open ? wiresOf(this.chosen) : []; }
+  get wires() { return this.open ? [...wiresOf(this.chosen), ...(this.put.spot ? marker(this.put.spot) : [])] : []; }
 
   show() {
     const { story, chosen, mask } = this, kind = chosen && Object.keys(chosen)[0];

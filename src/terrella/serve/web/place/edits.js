@@ -27,18 +27,25 @@ export function select(scene, chosen) {
   return mask;
 }
 
-/** The middle of what is selected: half way between its ends along each axis. */
-export function middleOf(scene, mask) {
+/** The ends of what is selected along each axis. */
+export function endsOf(scene, mask) {
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   for (let k = 0; k < scene.length; k += 1) {
     if (!mask[k]) continue;
     for (let a = 0; a < 3; a += 1) { low[a] = Math.min(low[a], scene.means[3 * k + a]); high[a] = Math.max(high[a], scene.means[3 * k + a]); }
   }
+  return { low, high };
+}
+
+/** The middle of what is selected: half way between its ends along each axis. */
+export function middleOf(scene, mask) {
+  const { low, high } = endsOf(scene, mask);
   return low.map((value, a) => (value + high[a]) / 2);
 }
 
 /** The scene after an edit; an Error where nothing is selected. What was changed counts as not seen. others: a Map of what merges bring. */
 export function edited(scene, edit, others) {
+  if (edit.do === 'merge' && edit.place.startsWith('things/')) return `put ${edit.place.slice(7).replace(/-\w+$/, '')} at ${edit.by.join(' ')} m`;
   if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
   if (!mask.count) throw new Error('nothing is selected there; choose another place.');
@@ -142,6 +149,7 @@ const recoloured = ({ colours }, colour) => (k) => colours.set(colour, 3 * k);
 
 /** An edit in words; `names` are those of the objects. */
 export function describe(edit, names = []) {
+  if (edit.do === 'merge' && edit.place.startsWith('things/')) return `put ${edit.place.slice(7).replace(/-\w+$/, '')} at ${edit.by.join(' ')} m`;
   if (edit.do === 'merge') return `merge ${edit.place.split('/').at(-1)} at ${edit.by.join(' ')} m${edit.degrees ? `, turned by ${edit.degrees}°` : ''}`;
   const kind = Object.keys(edit.select)[0], what = kind === 'all' ? 'everything' : kind === 'object' ? (names[edit.select.object - 1] || `object ${edit.select.object}`) : `a ${kind}`;
   const more = { move: () => `by ${edit.by.join(' ')} m`, duplicate: () => `${edit.by.join(' ')} m away`, turn: () => `by ${edit.degrees}°`, scale: () => `× ${edit.factor}`, recolour: () => '', delete: () => '' }[edit.do]();

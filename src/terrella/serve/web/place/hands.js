@@ -4,12 +4,15 @@ const KEYS = { KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
 const STICK = 60;  // pixels from a thumb's rest to full speed
 
 export class Hands {
-  /** on: look(dx, dy in pixels), tool(event name, pointer event) -> whether it takes it, moved(). */
+  /** on: look(dx, dy in pixels), zoom(factor of two fingers), tool(event name, pointer event) -> whether it takes it, key(event) -> likewise,
+   * still() -> whether no thumb walks, moved(). */
   constructor(canvas, stick, on) {
     Object.assign(this, { held: new Set(), fingers: new Map(), thumb: [0, 0], on, fast: false });
     addEventListener('keydown', (event) => {
       this.fast = event.shiftKey;
-      if (event.target.closest?.('input, textarea') || event.ctrlKey || event.metaKey || event.altKey || !(event.code in KEYS)) return;
+      if (event.target.closest?.('input, textarea') || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (on.key(event)) { event.preventDefault(); return; }
+      if (!(event.code in KEYS)) return;
       if (event.target.closest?.('button') && event.code === 'Space') return;
       event.preventDefault();
       this.held.add(event.code);
@@ -33,7 +36,7 @@ export class Hands {
     document.activeElement?.blur?.();
     canvas.setPointerCapture(event.pointerId);
     const tool = event.button === 0 && this.on.tool('down', event);
-    const walks = !tool && event.pointerType === 'touch' && event.clientX < innerWidth * 0.45;
+    const walks = !tool && event.pointerType === 'touch' && !this.on.still() && event.clientX < innerWidth * 0.45;
     this.fingers.set(event.pointerId, { x: event.clientX, y: event.clientY, does: tool ? 'tool' : walks ? 'walk' : 'look' });
     if (walks) Object.assign(stick, { hidden: false }) && Object.assign(stick.style, { left: `${event.clientX}px`, top: `${event.clientY}px` });
   }
@@ -49,7 +52,9 @@ export class Hands {
       stick.firstElementChild.style.transform = `translate(${(dx / long) * STICK}px, ${(dy / long) * STICK}px)`;
       this.on.moved();
     } else {
-      this.on.look(dx, dy);
+      const other = [...this.fingers.values()].find((one) => one !== finger && one.does === 'look'), apart = (x, y) => Math.hypot(x - other.x, y - other.y);
+      if (other) this.on.zoom(apart(event.clientX, event.clientY) / Math.max(apart(finger.x, finger.y), 1));
+      else this.on.look(dx, dy);
       Object.assign(finger, { x: event.clientX, y: event.clientY });
     }
   }

@@ -7,7 +7,7 @@ const round = (value) => Math.round(value * 1000) / 1000, dot = (a, b) => a[0] *
 const LEAST = 0.05;  // metres of a selection
 
 export class Selecting {
-  /** on: scene(), eye(), lens(), mask(), choose(selection), preview(shift), move(shift), say(text). */
+  /** on: scene(), eye(), lens(), mask(), choose(selection), preview(shift), move(shift), say(text), spot(direction), write(), look(dx, dy). */
   constructor(on) { Object.assign(this, { on, tool: 'sphere', doing: null, radius: 0.25 }); }
 
   way(event) {
@@ -16,8 +16,10 @@ export class Selecting {
 
   handle(name, event) {
     if (name === 'down') return this.down(event);
-    if (name === 'drag' && this.doing && this.doing.does !== 'nothing') this.drag(event);
+    if (name === 'drag' && this.doing?.does === 'nothing') this.on.look(event.movementX, event.movementY);
+    else if (name === 'drag' && this.doing) this.drag(event);
     if (name === 'up' && this.doing) this.up();
+    if (name === 'up' && this.tool === 'put') this.on.write();  // a press itself takes the focus away
     return false;
   }
 
@@ -25,7 +27,10 @@ export class Selecting {
     const way = this.way(event), hit = pick(this.on.scene(), this.on.eye().place, way);
     if (!hit) return false;
     const from = hit.place, brushes = this.tool === 'brush';
-    if (this.on.mask()?.[hit.number] && !brushes) this.doing = { does: 'move', from, shift: [0, 0, 0] };
+    if (this.tool === 'put') {
+      this.on.spot(way);
+      this.doing = { does: 'nothing' };
+    } else if (this.on.mask()?.[hit.number] && !brushes) this.doing = { does: 'move', from, shift: [0, 0, 0] };
     else if (this.tool === 'object') {
       const number = Math.max(0, this.on.scene().objects[hit.number]);
       if (number) this.on.choose({ object: number });

@@ -11,6 +11,16 @@ export function wiresOf(chosen) {
   return [];
 }
 
+/** A ring on the floor with a tick in front: where something is to be put. */
+export function marker({ at, floor, degrees }) {
+  const points = [], parts = 48, turn = (degrees * Math.PI) / 180, z = floor + 0.02;
+  for (const radius of [0.32, 0.06]) for (let k = 0; k < parts; k += 1) for (const end of [k, k + 1]) {
+    points.push(at[0] + radius * Math.cos((2 * Math.PI * end) / parts), at[1] + radius * Math.sin((2 * Math.PI * end) / parts), z);
+  }
+  for (const far of [0.32, 0.5]) points.push(at[0] + far * Math.sin(turn), at[1] - far * Math.cos(turn), z);
+  return [{ points: new Float32Array(points), colour: COLOUR }];
+}
+
 function box([x0, y0, z0, x1, y1, z1]) {
   const at = (k) => [k & 1 ? x1 : x0, k & 2 ? y1 : y0, k & 4 ? z1 : z0], points = [];
   for (let k = 0; k < 8; k += 1) for (const bit of [1, 2, 4]) if (!(k & bit)) points.push(...at(k), ...at(k | bit));

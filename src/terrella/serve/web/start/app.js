@@ -1,43 +1,39 @@
 // The start page: cards of what can be opened. A click opens it on the server, and the page of it follows.
 
-const query = new URLSearchParams(location.search), token = query.has('token') ? `&token=${encodeURIComponent(query.get('token'))}` : '';
-const $ = (id) => document.getElementById(id), make = (tag, fields = {}) => Object.assign(document.createElement(tag), fields);
+import { address, go, make } from './asking.js';
+
+const $ = (id) => document.getElementById(id), MOST_PICTURE = 32 << 20;
 const WORD = { place: 'Walk', recording: 'Look' };
 
 function card({ name, title, section, text }) {
   const button = make('button', { className: 'card', type: 'button' }), figure = make('figure');
-  const image = make('img', { alt: '', loading: 'lazy', src: `/start/thumbnail?name=${encodeURIComponent(name)}${token}` });
+  const image = make('img', { alt: '', loading: 'lazy', src: address(`/start/thumbnail?name=${encodeURIComponent(name)}`) });
   image.onload = () => image.classList.add('there');
   figure.append(image, make('span', { textContent: WORD[section] ?? 'Play' }));
   button.append(figure, make('b', { textContent: title }), make('p', { textContent: text }));
-  button.onclick = () => go('open', { name }, `Opening ${title} …`);
+  button.onclick = () => go('open', JSON.stringify({ name }), `Opening ${title} …`);
   return button;
-}
-
-/** Asks the server for a page, and goes there. */
-async function go(path, body, words) {
-  const cover = $('opening');
-  const show = (text, failed) => { cover.hidden = false; cover.classList.toggle('failed', failed); cover.firstElementChild.textContent = text; };
-  show(words, false);
-  try {
-    const answer = await fetch(`/start/${path}?${token.slice(1)}`, { method: 'POST', body: JSON.stringify(body) });
-    if (!answer.ok) return show(await answer.text(), true);
-    sessionStorage.removeItem('terrella-session');
-    location.href = `/?open${token}`;
-  } catch {
-    show('The server does not answer. Start it again: terrella play', true);
-  }
 }
 
 $('words').onsubmit = (event) => {
   event.preventDefault();
   const words = $('describe').value.trim() || $('describe').placeholder;
-  go('build', { words }, 'Building the place …');
+  go('build', JSON.stringify({ words }), 'Building the place …');
 };
-$('opening').onclick = () => { if ($('opening').classList.contains('failed')) $('opening').hidden = true; };
-addEventListener('pageshow', () => { $('opening').hidden = true; });
+/** Sends a picture, which becomes a place. */
+function lift(file) {
+  if (!file) return;
+  if (file.size > MOST_PICTURE) $('wrong').textContent = `${file.name} has ${Math.round(file.size / (1 << 20))} MB; 32 is the most. Save it smaller.`;
+  else go(`picture?name=${encodeURIComponent(file.name)}`, file, 'Estimating depth …');
+}
 
-const cards = await (await fetch(`/start/cards?${token.slice(1)}`)).json();
+$('picture').onchange = () => { lift($('picture').files[0]); $('picture').value = ''; };
+addEventListener('dragover', (event) => { event.preventDefault(); $('drop').classList.add('over'); });
+addEventListener('dragleave', (event) => { if (!event.relatedTarget) $('drop').classList.remove('over'); });
+addEventListener('drop', (event) => { event.preventDefault(); $('drop').classList.remove('over'); lift(event.dataTransfer.files[0]); });
+$('plan').href = address('/start/draw');
+
+const cards = await (await fetch(address('/start/cards'))).json();
 for (const one of cards) {
   $(one.section).hidden = false;
   $(one.section).querySelector('.cards').append(card(one));
