@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from terrella.core import make_rng
 from terrella.space.billboards import PICTURE, paint_billboards
 from terrella.space.camera import FAR_M, planar_pose, rotation
-from terrella.space.floorplan import NOWHERE, slide, slide_slowly, straight_runs, straight_runs_slowly
+from terrella.space.floorplan import NOWHERE, columns_left, slide, slide_slowly, straight_runs, straight_runs_slowly
 from terrella.space.kernels_numba.recall import pick as pick_kernel
 from terrella.space.keyframes import ANYWAY, Keyframes, pick_slowly
 from terrella.space.patches import cast as cast_boxes
@@ -164,12 +164,12 @@ def test_bodies_slide_as_the_slow_twin_does():
 
 def test_straight_runs_are_those_of_the_slow_twin():
     rng = make_rng(9)
-    left = torch.linspace(1, -1, 64, dtype=torch.float64)
+    left = columns_left(64, 0.5, 0.5)
     slope, level = (torch.rand(20, 4, 1, generator=rng, dtype=torch.float64) - part for part in (0.5, -0.3))
     inverse = (slope * left.view(4, 16) + level).flatten(1).clamp(1e-3, 20)
     inverse[5] = torch.rand(64, generator=rng, dtype=torch.float64)
-    runs = straight_runs(inverse, left)
-    torch.testing.assert_close(runs, straight_runs_slowly(inverse, left))
+    runs = straight_runs(inverse, 0.5, 0.5)
+    torch.testing.assert_close(runs, straight_runs_slowly(inverse, 0.5, 0.5))
     assert (runs[..., 1] > 0).sum() > 40
 
 

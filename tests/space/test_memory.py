@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from terrella.core import State
 from terrella.space.camera import yaw
 from terrella.space.keyframes import Keyframes, doubled
-from terrella.space.memory import DREAMT, EMPTY, OBSERVED, PAGE, Memory
+from terrella.space.memory import DREAMT, EMPTY, OBSERVED, PAGE, ROWS, Memory
 
 from .rooms import CAMERA, SIZE, painted, pose_at, room_depth
 
@@ -126,7 +126,7 @@ def test_the_whole_memory_runs_on_another_device():
 def test_it_forgets_what_the_others_cover_best():
     memory = small(3)
     held = after(memory, memory.empty(1), *(view(0, 0, math.radians(turn)) for turn in (0, 20, 150)))
-    assert memory.covered(held, torch.tensor([0]))[0].argmax() != 2
+    assert memory.covered(held, held[ROWS], held["memory_kind"] == DREAMT)[0].argmax() != 2
     held = after(memory, held, view(0, 0, math.radians(-100)))
     assert 150 in headings(memory, held) and -100 in headings(memory, held)
     assert headings(memory, held)[1] in (0, 20)
@@ -155,10 +155,10 @@ def test_evidence_is_not_forgotten_because_a_dream_covers_it():
     memory = small(3)
     held = after(memory, memory.empty(1), view(0, 0, 0.0), view(0, 0, 2.0))
     held = after(memory, held, view(0.3, 0.1, 0.21), kind=DREAMT)
-    everyone = torch.tensor([0])
-    covered = memory.covered(held, everyone)[0]
+    given = held, held[ROWS], held["memory_kind"] == DREAMT
+    covered = memory.covered(*given)[0]
     assert covered[0] == 0 and covered[2] > 0.3
-    torch.testing.assert_close(memory.covered_slowly(held, everyone)[0], covered, atol=0.05, rtol=0)
+    torch.testing.assert_close(memory.covered_slowly(*given)[0], covered, atol=0.05, rtol=0)
     held = after(memory, held, view(0, 0, -2.0))
     assert (held["memory_kind"][0] == OBSERVED).all() and headings(memory, held) == [-115, 0, 115]
 

@@ -43,11 +43,11 @@ def latent(pictures: bool) -> LatentWorld:
 
 
 WORLDS = {
-    "doom-maze": (lambda: terrella.load("doom-maze"), 1530),
-    "doom-corridor": (lambda: terrella.load("doom-corridor"), 2180),
+    "doom-maze": (lambda: terrella.load("doom-maze"), 1060),
+    "doom-corridor": (lambda: terrella.load("doom-corridor"), 1490),
     "flow": (lambda: flow(0), 300),
-    "flow that scrolls": (lambda: flow(15), 450),
-    "islet": (lambda: terrella.load("islet"), 605),
+    "flow that scrolls": (lambda: flow(15), 425),
+    "islet": (lambda: terrella.load("islet"), 560),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }

@@ -39,6 +39,11 @@ def table(*rows: Any) -> torch.Tensor:
     return torch.tensor(rows, dtype=torch.float32)
 
 
+def plus(number: float, tensor: torch.Tensor, times: float = 1) -> torch.Tensor:
+    """number + times * tensor, in one kernel."""
+    return torch.add(constant(torch.tensor, tensor.device, number), tensor, alpha=times)
+
+
 def where(mask: torch.Tensor, one: torch.Tensor, other: float) -> torch.Tensor:
     """torch.where(mask, one, other) with a number that is not written to the device at every call."""
     return torch.where(mask, one, constant(torch.tensor, one.device, other))

@@ -5,7 +5,7 @@ generator (Salmon et al. 2011).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
@@ -31,6 +31,19 @@ def uniform(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> 
     return _halves(seeds, math.prod(shape), stream)[1].view(len(seeds), *shape)
 
 
+def uniforms(seeds: torch.Tensor, shapes: Mapping[int, Sequence[int]]) -> dict[int, torch.Tensor]:
+    """`uniform` of several streams, {stream: shape}, at once."""
+    if kernels_do(seeds):
+        return {stream: uniform(seeds, shape, stream) for stream, shape in shapes.items()}
+    counts = [math.prod(shape) for shape in shapes.values()]
+    streams, which, steps = constant(_layout, seeds.device, tuple(shapes), tuple(counts)).split(
+        (len(counts), *[sum(counts)] * 2)
+    )
+    keys = _mixed(seeds[:, None] + streams)
+    numbers = _scaled(_mixed(keys[:, which] + steps), 8).split(counts, 1)
+    return {stream: part.view(len(seeds), *shape) for part, (stream, shape) in zip(numbers, shapes.items())}
+
+
 def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
     """float32 [B, *shape], standard normal (Box & Muller 1958)."""
     count = math.prod(shape)
@@ -42,9 +55,14 @@ def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> t
 
 def choice(seeds: torch.Tensor, probabilities: torch.Tensor, stream: int = 0) -> torch.Tensor:
     """int64 [B, ...] drawn from `probabilities` [B, ..., K], which need not sum to 1; entries of 0 are never drawn."""
-    sums = probabilities.double().cumsum(-1)
-    point = uniform(seeds, probabilities.shape[1:-1], stream).double()[..., None] * sums[..., -1:]
-    return (sums <= point).sum(-1).clamp_max(probabilities.shape[-1] - 1)
+    return chosen(uniform(seeds, probabilities.shape[1:-1], stream), probabilities)
+
+
+def chosen(point: torch.Tensor, probabilities: torch.Tensor) -> torch.Tensor:
+    """The same as `choice`, by numbers of `uniform` [B, ...]."""
+    sums = probabilities.cumsum(-1, dtype=torch.float64)
+    picked = torch.searchsorted(sums, point[..., None] * sums[..., -1:], right=True)[..., 0]
+    return picked.clamp_max(probabilities.shape[-1] - 1)
 
 
 def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -62,6 +80,16 @@ def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.
     mixed = _mixed(key + constant(_steps, seeds.device, count))[None]
     high, low = (((mixed >> constant(_shifts, seeds.device)) & 0xFFFFFF) * 2.0**-24).unbind(0)
     return high, low
+
+
+def _layout(streams: tuple[int, ...], counts: tuple[int, ...]) -> torch.Tensor:
+    """For `uniforms`, one after another: what streams add to seeds; the stream of each number; what its place adds to the key."""
+    which = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+    return torch.cat([*(_stream(number)[None] for number in streams), which, *(_steps(count) for count in counts)])
+
+
+def _scaled(mixed: torch.Tensor, shift: int) -> torch.Tensor:
+    return ((mixed >> shift) & 0xFFFFFF) * 2.0**-24
 
 
 def _stream(number: int) -> torch.Tensor:

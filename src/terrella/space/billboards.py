@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import kernels_do
-from .camera import Intrinsics, project
+from ..core.backend import constant, kernels_do, plus, table, where
+from .camera import Intrinsics, pixel_intrinsics, project
 from .kernels_numba.paint import TOUCHED, paint_views
 from .views import arrays, over_views
 
@@ -49,16 +49,16 @@ def cut_out(
     if not len(view):
         nothing = torch.zeros(0)
         return Cutout(view, row, torch.zeros(0, 4, *PICTURE), torch.zeros(0, 4), nothing.long(), nothing.bool())
-    where, ahead = project(places, pose, camera)
-    where, ahead = where[view, row], ahead[view, row].clamp_min(NEAREST_M)
+    at, ahead = project(places, pose, camera)
+    at, ahead = at[view, row], ahead[view, row].clamp_min(NEAREST_M)
     first_column, last_column = _ends(masks.any(1))
     first_row, last_row = _ends(masks.any(2))
     left, right = first_column / width, (last_column + 1) / width
     top, bottom = first_row / height, (last_row + 1) / height
     across, along = ahead / camera[0], ahead / camera[1]
     box = torch.stack(
-        [(where[:, 0] - left) * across, (right - where[:, 0]) * across,
-         (bottom - where[:, 1]) * along, (where[:, 1] - top) * along], 1
+        [(at[:, 0] - left) * across, (right - at[:, 0]) * across,
+         (bottom - at[:, 1]) * along, (at[:, 1] - top) * along], 1
     )  # fmt: skip
     grid = F.affine_grid(_onto(left, right, top, bottom), [len(view), 1, *PICTURE], align_corners=False)
     frames = torch.cat([rgb.float()[view] / 255 * masks[:, None], masks[:, None].float()], 1)
@@ -96,16 +96,13 @@ def paint_billboards(
 def _placed(billboards, present, pose, camera, size) -> tuple[torch.Tensor, ...]:
     """Billboards in pictures of `size`: their order [B, K], the nearest last; which are in front of the camera [B, K]; the sides
     of their boxes [B, K, 4] in pixels (left, right, top, bottom); and their depths [B, K]."""
-    (places, _, boxes), (height, width) = billboards, size
-    where, ahead = project(places, pose, camera)
+    places, _, boxes = billboards
+    at, ahead = project(places, pose, lens := pixel_intrinsics(camera, size))
     present = present & (ahead > NEAREST_M)
-    far = torch.where(present, ahead, 1.0)
-    sides = torch.stack(
-        [where[..., 0] * width - boxes[..., 0] / far * camera[0] * width,
-         where[..., 0] * width + boxes[..., 1] / far * camera[0] * width,
-         where[..., 1] * height - boxes[..., 3] / far * camera[1] * height,
-         where[..., 1] * height + boxes[..., 2] / far * camera[1] * height], -1
-    )  # fmt: skip
+    far = where(present, ahead, 1.0)
+    order = constant(torch.tensor, pose.device, (0, 1, 3, 2))
+    focal = constant(table, pose.device, (-lens[0], lens[0]), (-lens[1], lens[1])) / far[..., None, None]
+    sides = torch.addcmul(at[..., None], boxes.index_select(2, order).unflatten(2, (2, 2)), focal).flatten(2)
     return far.argsort(dim=1, descending=True, stable=True), present, sides, far
 
 
@@ -116,30 +113,35 @@ def paint_billboards_slowly(
     (batch, height, width), count = depth.shape, billboards[0].shape[1]
     order, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
     pictures = billboards[1].flatten(0, 1)
-    quarters = (
-        torch.arange(2 * max(height, width), device=rgb.device) / 2 + 0.25
-    )  # two samples along each side of a pixel
-    left, right, top, bottom = sides.clamp(-1e6, 1e6)[..., None].unbind(2)
-    across = (quarters[: 2 * width] - left) / (right - left).clamp_min(1e-6) * 2 - 1
-    down = (quarters[: 2 * height] - top) / (bottom - top).clamp_min(1e-6) * 2 - 1
+    quarters = constant(_quarters, rgb.device, 2 * max(height, width))
+    first, last = sides.clamp(-1e6, 1e6).view(batch, count, 2, 2, 1).unbind(3)
+    at = plus(-1.0, (quarters - first) / (last - first).clamp_min(1e-6), 2)
+    across, down = at[:, :, 0, : 2 * width], at[:, :, 1, : 2 * height]
     grid = torch.stack(torch.broadcast_tensors(across[:, :, None], down[..., None]), -1)
     drawn = F.grid_sample(pictures, grid.flatten(0, 1), padding_mode="border", align_corners=False)
-    mask = (drawn[:, 3:] > 0.5) & (grid.abs().amax(-1) <= 1).flatten(0, 1)[:, None]
-    small = F.avg_pool2d(torch.cat([drawn[:, :3] * mask, mask.float()], 1), 2).unflatten(0, (batch, count))
+    within = torch.linalg.vector_norm(grid, torch.inf, dim=-1) <= 1
+    mask = (drawn[:, 3:] > 0.5) & within.flatten(0, 1)[:, None]
+    small = F.avg_pool2d(torch.cat([drawn[:, :3] * mask, mask], 1), 2).unflatten(0, (batch, count))
     shown = (far[..., None, None] < (depth + BEHIND_M)[:, None]) & present[..., None, None]
     small = small * shown[:, :, None]
-    # the nearest last; what is left of each after those before it
-    turn = order[..., None, None, None].expand_as(small)
-    small, far = small.gather(1, turn), far.gather(1, order)
+    # the nearest first; what is left of each after those before it
+    order = order.flip(1)
+    small = small.gather(1, order[..., None, None, None].expand_as(small))
     colour, cover = small[:, :, :3], small[:, :, 3]
-    left = F.pad((1 - cover).flip(1).cumprod(1), (0, 0, 0, 0, 1, 0), value=1.0).flip(1)
-    rgb = rgb * left[:, :1] + (colour * left[:, 1:, None]).sum(1)
-    ranks = torch.arange(1, count + 1, device=rgb.device)[:, None, None]
-    onto, touched = (((cover > least) * ranks).amax(1) for least in (0.5, TOUCHED))
-    depths, numbers = F.pad(far, (1, 0)), F.pad(order + 1, (1, 0))
+    left = F.pad((1 - cover).cumprod(1), (0, 0, 0, 0, 1, 0), value=1.0)
+    rgb = torch.addcmul((colour * left[:, :-1, None]).sum(1), rgb, left[:, -1:])
+    ranks = constant(torch.arange, rgb.device, count, 0, -1)[:, None, None]
+    least = constant(torch.tensor, rgb.device, (0.5, TOUCHED))[:, None, None, None, None]
+    onto, touched = ((cover > least) * ranks).amax(2)  # by how near they are, 0 for none
+    depths, numbers = F.pad(far.gather(1, order), (0, 1)).flip(1), F.pad(order + 1, (0, 1)).flip(1)
     nearest = depths.gather(1, onto.flatten(1)).view_as(depth)
     instances = numbers.gather(1, touched.flatten(1)).view_as(depth).to(torch.uint8)
     return rgb, torch.where(onto > 0, nearest, depth), instances
+
+
+def _quarters(count: int) -> torch.Tensor:
+    """Two samples along each side of a pixel."""
+    return torch.arange(count) / 2 + 0.25
 
 
 def _ends(line: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -28,6 +28,7 @@ _TURN = torch.tensor(  # from the products ww, wx, wy, wz, xw, ... of a quaterni
     dtype=torch.float32,
 ).view(16, 9)  # fmt: skip
 _TURN = torch.cat([_TURN, torch.eye(4).view(16, 1)], 1)  # times its squared length, which comes last
+_ABOVE_0 = torch.tensor([0.0] * 9 + [1e-24])  # added to that
 _HEADING = torch.zeros(16, 2)  # sine and cosine of the heading, less (0, 1/2)
 _AHEAD = torch.tensor([0.0, 0.5])
 _HEADING[[3, 6], 0], _HEADING[[10, 15], 1] = 1.0, -1.0
@@ -47,9 +48,9 @@ def _rays(camera: Intrinsics, height: int, width: int) -> torch.Tensor:
 
 def rotation(pose: torch.Tensor) -> torch.Tensor:
     """Rotation matrices of T_world_cam: [..., 7] -> [..., 3, 3]."""
-    turn, stay = (constant(part.to, pose.device, pose.dtype) for part in (_TURN, _STAY))
-    turned = _products(pose) @ turn
-    return torch.addcdiv(stay, turned[..., :9], turned[..., 9:].clamp_min(1e-24)).unflatten(-1, (3, 3))
+    turn, stay, above = (constant(part.to, pose.device, pose.dtype) for part in (_TURN, _STAY, _ABOVE_0))
+    turned = torch.addmm(above, _products(pose).reshape(-1, 16), turn)
+    return torch.addcdiv(stay, turned[:, :9], turned[:, 9:]).view(*pose.shape[:-1], 3, 3)
 
 
 def _products(pose: torch.Tensor) -> torch.Tensor:
@@ -58,20 +59,52 @@ def _products(pose: torch.Tensor) -> torch.Tensor:
     return (quaternion[..., :, None] * quaternion[..., None, :]).flatten(-2)
 
 
-def unproject(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor:
-    """Depth [..., H, W] seen from `pose` [..., 7] -> world points [..., H, W, 3]."""
+def unproject(
+    depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, turn: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Depth [..., H, W] seen from `pose` [..., 7], whose rotations are `turn` [..., 3, 3] -> world points [..., H, W, 3]."""
     points = (depth[..., None] * rays(camera, *depth.shape[-2:], device=depth.device)).flatten(-3, -2)
-    eye, turn = pose[..., None, :3].reshape(-1, 1, 3), rotation(pose).mT.reshape(-1, 3, 3)
+    turn = rotation(pose) if turn is None else turn
+    eye, turn = pose[..., None, :3].reshape(-1, 1, 3), turn.mT.reshape(-1, 3, 3)
     return torch.baddbmm(eye, points.reshape(-1, *points.shape[-2:]), turn).view(*depth.shape, 3)
 
 
-def project(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -> tuple[torch.Tensor, torch.Tensor]:
-    """World points [..., N, 3] into the view of `pose` [..., 7]: image coordinates in [0, 1] [..., N, 2], depth [..., N]. Points
-    behind the camera have depth <= 0 and meaningless coordinates."""
+def project(
+    points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, turn: torch.Tensor | None = None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """World points [..., N, 3] into the view of `pose` [..., 7], whose rotations are `turn` [..., 3, 3]: image coordinates in
+    [0, 1] [..., N, 2], depth [..., N]. Points behind the camera have depth <= 0 and meaningless coordinates."""
+    turn = rotation(pose) if turn is None else turn
     scale, middle = (constant(table, pose.device, *row) for row in ((1.0, -camera[0], -camera[1]), camera[2:]))
-    local = (points - pose[..., None, :3]) @ (rotation(pose) * scale)
+    local = (points - pose[..., None, :3]) @ (turn * scale)
     depth = local[..., 0]
     return torch.addcdiv(middle, local[..., 1:], depth.clamp_min(1e-4)[..., None]), depth
+
+
+def pixel_intrinsics(camera: Intrinsics, size: tuple[int, int]) -> Intrinsics:
+    """Those by which `project` gives pixels, [0, W] x [0, H]."""
+    (fx, fy, cx, cy), (height, width) = camera, size
+    return fx * width, fy * height, cx * width, cy * height
+
+
+def grid_intrinsics(camera: Intrinsics) -> Intrinsics:
+    """Those by which `project` gives [-1, 1], as torch's `grid_sample` wants it."""
+    fx, fy, cx, cy = camera
+    return 2 * fx, 2 * fy, 2 * cx - 1, 2 * cy - 1
+
+
+def pixels_at(places: torch.Tensor, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """The pixel at each of `places` [..., 2], counted along rows, or the nearest: int64 [...]; and whether it lies in the picture,
+    bool [...]."""
+    inside = torch.fmax(places, constant(torch.tensor, places.device, 0.0))  # fmax and fmin pass over nan
+    inside = torch.fmin(inside, constant(_last, places.device, *size))
+    column, row = inside.long().unbind(-1)
+    return torch.add(column, row, alpha=size[1]), (inside == places).all(-1)
+
+
+def _last(height: int, width: int) -> torch.Tensor:
+    """The largest coordinates that lie in a picture."""
+    return torch.nextafter(torch.tensor([float(width), float(height)]), torch.zeros(2))
 
 
 def relative_pose(body: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:
@@ -94,5 +127,5 @@ def yaw(pose: torch.Tensor) -> torch.Tensor:
 def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:
     """A level pose at (x, y, z) metres that looks along `heading` radians: [...] each -> [..., 7]."""
     half = heading / 2
-    zero = torch.zeros_like(half)
+    zero = constant(torch.tensor, half.device, 0.0).expand_as(half)
     return torch.stack([x, y, z, torch.cos(half), zero, zero, torch.sin(half)], -1)

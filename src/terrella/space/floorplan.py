@@ -1,6 +1,7 @@
 """Floor plans from depth images: straight walls at the camera's height, and bodies that slide along them. World frame, metres; a
 body is an axis-aligned upright box, as in Doom and Quake."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -29,111 +30,125 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
 
     On the horizon the inverse depth of a flat wall is linear in the column; runs that meet are extended to their corner. Walls
     farther than SEEN_M, or so far that neighbouring columns are half a metre apart, are left out."""
-    width, row = depth.shape[-1], horizon(camera, depth.shape[-2])
-    columns = torch.arange(width, dtype=torch.float64, device=depth.device)
-    left = -((columns + 0.5) / width - camera[2]) / camera[0]
-    inverse = 1 / torch.where(depth[:, row] > 0, depth[:, row], 1e3).double().clamp(0.05, 1e3)
-    runs = straight_runs(inverse, left)
-    first, stop, slope, level = runs[..., 0].long(), runs[..., 1].long(), runs[..., 2], runs[..., 3]
-    sides = _corners(first, stop, slope, level, left)
-    sums = F.pad(inverse.cumsum(1), (1, 0))
-    long = stop - first
-    mean = (sums.gather(1, stop) - sums.gather(1, first)) / long.clamp_min(1)
-    known = (long > 0) & ((long >= FEWEST_FAR) | (1 / mean < NEARBY_M))
-    most, order = torch.where(known, long, 0).sort(dim=1, descending=True, stable=True)
-    sides, slope, level = (part.gather(-1, order.expand(part.shape)) for part in (sides, slope, level))
-    ahead = 1 / torch.where(most > 0, slope * sides + level, 1.0)
-    heading, position = yaw(pose).double()[:, None], pose[:, :2].double()[..., None]
-    cosine, sine, beside = heading.cos(), heading.sin(), ahead * sides
-    x = torch.addcmul(torch.addcmul(position[:, 0], ahead, cosine), beside, sine, value=-1)
-    y = torch.addcmul(torch.addcmul(position[:, 1], ahead, sine), beside, cosine)
-    walls = where(most > 0, torch.stack([x[0], y[0], x[1], y[1]]), NOWHERE).permute(1, 2, 0)[:, :WALLS].float()
-    return F.pad(walls, (0, 0, 0, WALLS - walls.shape[1]), value=NOWHERE)
+    row, lens = depth[:, horizon(camera, depth.shape[-2])], (camera[0], camera[2])
+    inverse = row.masked_fill(row <= 0, 1e3).double().clamp(0.05, 1e3).reciprocal()
+    runs = straight_runs(inverse, *lens)
+    spans = F.pad(inverse.cumsum(1), (1, 0)).gather(1, runs[..., :2].long().flatten(1)).view_as(runs[..., :2])
+    long, whole = runs[..., :2].diff(dim=2)[..., 0], spans.diff(dim=2)[..., 0]
+    known = (long >= FEWEST_FAR) | (whole * NEARBY_M > long)
+    most, order = (long * known).sort(dim=1, descending=True, stable=True)
+    lines = torch.cat([_corners(runs, depth.shape[-1], *lens), runs[..., 2:]], 2)
+    sides, slope, level = lines.gather(1, order[..., None].expand(-1, -1, 4)).split([2, 1, 1], 2)
+    ahead = torch.addcmul(level, slope, sides).reciprocal()
+    turn = (yaw(pose)[:, None] + constant(_doubles, depth.device, *_TURNED)).cos().view(-1, 2, 2)
+    ends = torch.stack([ahead, ahead * sides], -1).flatten(1, 2)
+    ends = torch.baddbmm(pose[:, None, :2].double(), ends, turn).view(*ahead.shape[:2], 4)
+    walls = where(most[..., None] > 0, ends, NOWHERE)[:, :WALLS].float()
+    missing = WALLS - walls.shape[1]
+    return F.pad(walls, (0, 0, 0, missing), value=NOWHERE) if missing > 0 else walls
 
 
-def straight_runs(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
-    """Runs of columns on which inverse depth [K, w] is linear in `left` [w] (float64 both), with neighbours less than GAP_M
-    apart and depths below SEEN_M: [K, n, 4] = first, stop, slope, level; zeros after the last."""
+_TURNED = 0.0, -math.pi / 2, math.pi / 2, 0.0  # the cosines of a heading and these are the matrix of its rotation
+
+
+def straight_runs(inverse: torch.Tensor, focal: float, middle: float) -> torch.Tensor:
+    """Runs of columns on which inverse depth [K, w] (float64) is linear, with neighbours less than GAP_M apart and depths below
+    SEEN_M: [K, n, 4] = first, stop, and slope and level over the side of a column (`columns_left`, whose arguments focal and
+    middle are); zeros after the last."""
     if not kernels_do(inverse):
-        return straight_runs_slowly(inverse, left)
+        return straight_runs_slowly(inverse, focal, middle)
+    left = constant(columns_left, inverse.device, inverse.shape[1], focal, middle)
     runs = inverse.new_zeros(len(inverse), inverse.shape[1] // FEWEST, 4)
     each_view(straight_runs_kernel, arrays(inverse, runs), *arrays(left), FEWEST, STRAIGHT, GAP_M, 1 / SEEN_M)
     return runs
 
 
-def straight_runs_slowly(inverse: torch.Tensor, left: torch.Tensor) -> torch.Tensor:
+def straight_runs_slowly(inverse: torch.Tensor, focal: float, middle: float) -> torch.Tensor:
     """The same as `straight_runs`, in plain tensor algebra, also for GPUs: lines through all runs at once, then the longest from
     every column, and of these a choice from left to right."""
-    count, width = inverse.shape
-    columns = constant(torch.arange, inverse.device, width)
-    near, far = 1 / inverse, left / inverse
-    joins = torch.hypot(near.diff(dim=1), far.diff(dim=1)) <= GAP_M
-    joins &= (inverse[:, 1:] >= 1 / SEEN_M) & (inverse[:, :-1] >= 1 / SEEN_M)
-    # [K, first, last] of runs from column `first` to column `last`; sums over them by differences of sums from the left
-    mean, both = _means(torch.stack([inverse, left * inverse]))
-    middle, square = _means(torch.stack([left, left.square()]))
-    spread = (square - middle.square()).clamp_min(1e-12)
-    slope = (both - middle * mean) / spread
-    level = mean - slope * middle
-    off = (slope[..., None] * left + level[..., None] - inverse[:, None, None]).abs()
-    off = (off * constant(_within, inverse.device, width)).amax(-1)
+    (count, width), device = inverse.shape, inverse.device
+    columns, onward, long = (constant(torch.arange, device, first, first + width) for first in (0, 1, FEWEST))
+    given = device, width, focal, middle
+    beside = constant(_beside, *given)
+    near = inverse.reciprocal().masked_fill(inverse < 1 / SEEN_M, torch.inf)
+    joins = torch.linalg.vector_norm((near[:, None] * beside).diff(dim=2), dim=1) <= GAP_M
+    # [K, first, last] of runs from column `first` to column `last`
+    lines = (inverse @ constant(_lines, *given)).view(count, -1, 2)
+    off = torch.baddbmm(inverse[:, None], lines, beside.expand(count, -1, -1), beta=-1).view(count, width, width, width)
+    off = torch.linalg.vector_norm(off.masked_fill(constant(_outside, device, width), 0.0), torch.inf, dim=3)
     most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
-    broken = F.pad((~joins).cumsum(1), (1, 0))
-    fits = (off <= STRAIGHT * most) & (broken[:, None] == broken[:, :, None]) & (columns > columns[:, None])
-    fits = fits | (columns == columns[:, None])
-    alive = fits.long().masked_fill(columns < columns[:, None], 1).cumprod(2)
-    stop = (alive * (columns >= columns[:, None])).sum(2) + columns
-    last = (stop - 1)[..., None]
-    slope, level = (part.gather(2, last)[..., 0] for part in (slope, level))
-    long = stop - columns >= FEWEST
-    # which columns a walk from the left comes to, by doubling its strides
-    onward = F.pad(torch.where(long, stop, columns + 1), (0, 1), value=width)
-    visited = F.pad(torch.ones_like(stop[:, :1]), (0, width))
-    for _ in range(width.bit_length()):
-        visited = visited.scatter_reduce(1, onward, visited, "amax")
-        onward = onward.gather(1, onward)
-    taken = long & (visited[:, :width] > 0)
-    runs = torch.stack([columns.expand(count, -1).double(), stop.double(), slope, level], 2) * taken[..., None]
-    order = (~taken).to(torch.uint8).argsort(dim=1, stable=True)[:, : width // FEWEST]
-    return runs.gather(1, order[..., None].expand(-1, -1, 4))
+    broken = constant(_after, device, width) > F.pad(joins, (1, 0), value=True)[:, None]
+    stop = where((off > STRAIGHT * most) | broken, columns, width).amin(2)
+    lines = lines.view(count, width, width, 2).gather(2, (stop - 1)[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
+    wide = stop >= long
+    # which columns a walk from the left comes to: how many ways of steps and stays lead there in 2 ** n moves
+    leads = torch.where(wide, stop, onward)[..., None] == columns
+    moves = torch.where(leads, constant(_doubles, device, 1.0), constant(_stay, device, width))
+    taken = wide & (torch.linalg.matrix_power(moves, 1 << (width - 1).bit_length())[:, 0] > 0)
+    order = where(taken, columns, width).argsort(dim=1)
+    runs = torch.cat([columns.expand(count, -1)[..., None], stop[..., None], lines], 2) * taken[..., None]
+    return runs.gather(1, order[:, : width // FEWEST, None].expand(-1, -1, 4))
 
 
-def _means(values: torch.Tensor) -> torch.Tensor:
-    """Means [..., first, last] of the values [..., w] from one column to another; meaningless where last < first."""
-    sums = F.pad(values.cumsum(-1), (1, 0))
-    return (sums[..., None, 1:] - sums[..., :-1, None]) / constant(_lengths, values.device, values.shape[-1])
+def columns_left(width: int, focal: float, middle: float) -> torch.Tensor:
+    """How far columns look to the left, per metre ahead: float64 [w]; of a camera whose focal length and principal point are these
+    shares of the width."""
+    return (middle - (torch.arange(width, dtype=torch.float64) + 0.5) / width) / focal
 
 
-def _lengths(width: int) -> torch.Tensor:
-    """[first, last]: columns from one to another, 1 where last < first."""
+def _beside(width: int, focal: float, middle: float) -> torch.Tensor:
+    """float64 [2, w]: `columns_left` and 1, by which slope and level are multiplied."""
+    left = columns_left(width, focal, middle)
+    return torch.stack([left, torch.ones_like(left)])
+
+
+def _lines(width: int, focal: float, middle: float) -> torch.Tensor:
+    """float64 [w, first * last * 2]: by which values of columns are multiplied for slope and level of the lines through them."""
+    left, inside = columns_left(width, focal, middle), (~_outside(width)).double()
+    count = inside.sum(2, keepdim=True).clamp_min(1)
+    apart = (left - (left * inside).sum(2, keepdim=True) / count) * inside
+    slope = apart / apart.square().sum(2, keepdim=True).clamp_min(1e-12)
+    level = inside / count - slope * (left * inside).sum(2, keepdim=True) / count
+    return torch.stack([slope, level], -1).permute(2, 0, 1, 3).reshape(width, -1)
+
+
+def _outside(width: int) -> torch.Tensor:
+    """bool [first, last, column]: whether a column does not lie between two others."""
     columns = torch.arange(width)
-    return (columns - columns[:, None] + 1).clamp_min(1)
+    return (columns < columns[:, None])[:, None] | (columns > columns[:, None])
 
 
-def _within(width: int) -> torch.Tensor:
-    """float64 [first, last, column]: 1 where a column lies between two others, 0 elsewhere."""
-    columns = torch.arange(width)
-    return ((columns >= columns[:, None])[:, None] & (columns <= columns[:, None])).double()
+def _after(width: int) -> torch.Tensor:
+    """bool [first, last]: whether a column lies after another."""
+    return torch.arange(width) > torch.arange(width)[:, None]
 
 
-def _corners(first, stop, slope, level, left) -> torch.Tensor:
-    """Both ends [2, K, n] of runs [K, n]: their outer columns, or the corner with a neighbour that they meet."""
-    last = len(left) - 1
-    begin, end = left[first.clamp_max(last)], left[(stop - 1).clamp_min(0)]
-    one, other = slice(None, -1), slice(1, None)
-    meet = (stop[:, other] > 0) & (first[:, other] - stop[:, one] <= 2) & (slope[:, one] != slope[:, other])
-    corner = (level[:, other] - level[:, one]) / torch.where(meet, slope[:, one] - slope[:, other], 1.0)
-    meet &= (corner >= left[(first[:, other] + 1).clamp_max(last)]) & (corner <= left[(stop[:, one] - 2).clamp_min(0)])
-    lines = [torch.stack([part[:, one], part[:, other]]) for part in (slope, level)]
-    meet &= (_apart(corner, torch.stack([end[:, one], begin[:, other]]), *lines) < GAP_M).all(0)
-    begin = torch.cat([begin[:, :1], torch.where(meet, corner, begin[:, other])], 1)
-    return torch.stack([begin, torch.cat([torch.where(meet, corner, end[:, one]), end[:, -1:]], 1)])
+def _stay(width: int) -> torch.Tensor:
+    return torch.eye(width, dtype=torch.float64)
 
 
-def _apart(one, other, slope, level) -> torch.Tensor:
-    """Metres between two columns of a run."""
-    near, far = 1 / (slope * one + level), 1 / (slope * other + level)
-    return torch.hypot(near - far, near * one - far * other)
+def _corners(runs: torch.Tensor, width: int, focal: float, middle: float) -> torch.Tensor:
+    """Both ends [K, n, 2] of runs [K, n, 4], as `columns_left`: their outer columns, or the corner with a neighbour that they
+    meet."""
+    column, ends = -1 / (width * focal), constant(_ends, runs.device, width, focal, middle)
+    ends = torch.add(ends, runs[..., :2], alpha=column).flatten(1)
+    edges = ends[:, 1:-1].unflatten(1, (-1, 2))  # where one ends, and the next begins
+    lines = runs[..., 2:].diff(dim=1)
+    corner = -(lines[..., 1] / lines[..., 0])
+    slope, level = (runs[..., part].unfold(1, 2, 1) for part in (2, 3))
+    places = torch.stack([corner[..., None].expand_as(edges), edges])
+    ahead = torch.addcmul(level, slope, places).reciprocal()
+    apart = torch.hypot(*(part.diff(dim=0)[0] for part in (ahead, ahead * places))).amax(2)
+    inside = corner == torch.clamp(corner, edges[..., 1] + column, edges[..., 0] - column)
+    meet = (runs[:, 1:, 0] - runs[:, :-1, 1] <= 2) & inside & (apart < GAP_M)
+    met = torch.where(meet[..., None], corner[..., None], edges).flatten(1)
+    return torch.cat([ends[:, :1], met, ends[:, -1:]], 1).unflatten(1, (-1, 2))
+
+
+def _ends(width: int, focal: float, middle: float) -> torch.Tensor:
+    """float64 [2]: where column 0 looks, and the column before it."""
+    left = columns_left(width, focal, middle)[0]
+    return torch.stack([left, left + 1 / (width * focal)])
 
 
 def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
@@ -212,77 +227,83 @@ def slide(
 def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor, torch.Tensor]:
     """The same as `slide`, in plain tensor algebra, also for GPUs."""
     whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1)
-    sides = _sides(F.pad(whole, (0, 0, 0, 1), value=NOWHERE).double(), half_m)
-    place, rest = places.double(), wish.double()
-    free = torch.ones_like(place[:, :1], dtype=torch.bool)
+    if not whole.shape[1]:
+        return wish, wish
+    sides = _sides(whole.double(), half_m)
+    place, rest, free = places.double(), wish.double(), None
     for bump in range(3):
         share, along = _first_touch(sides, place, rest)
         blocked = share <= 1
         go = where(blocked, (share - short).clamp_min(0), 1.0)
-        place = place + go * rest * free
-        free = free & blocked
+        place = torch.addcmul(place, go if free is None else go * free, rest)
+        free = blocked if free is None else free & blocked
         if bump < 2:
-            onward = (1 - share.clamp_min(0)) * (rest * along).sum(1, keepdim=True) * along
+            onward = (rest * along).sum(1, keepdim=True) * (1 - share).clamp_max(1) * along
             rest = torch.where(free, onward, rest)
         else:
-            rest = rest * ~free
+            rest = rest.masked_fill(free, 0.0)
     return (place - places).to(wish), rest.to(wish)
 
 
 class _Sides(NamedTuple):
-    """Walls [B, S] by their separating axes x, y and across: the axes [B, S, 3, 2]; how far along each lie the ends of a wall that
-    is a body's half width larger, low and high [B, S, 3]; the sines [B, S, 3, 3] of the angles between axes; real [B, S]."""
+    """Walls [B, S] by their separating axes x, y and across: the axes [B, 3 S, 2]; the direction along each [B, 3 S, 2]; how far
+    along each lie the ends of a wall that is a body's half width larger [B, S, 3, 2], nan for no wall, and their middles [B, S, 3];
+    how near to these a box that touches by one axis has to be, seen along another, so that it does not only graze the wall
+    [B, S, 3, 3]."""
 
     unit: torch.Tensor
-    low: torch.Tensor
-    high: torch.Tensor
-    crossing: torch.Tensor
-    real: torch.Tensor
+    onward: torch.Tensor
+    ends: torch.Tensor
+    middle: torch.Tensor
+    near: torch.Tensor
 
 
 def _sides(walls: torch.Tensor, half: float) -> _Sides:
     """Of walls [B, S, 4]."""
     ends = walls.unflatten(-1, (2, 2))
     along = ends[..., 1, :] - ends[..., 0, :]
-    length = along.norm(dim=-1, keepdim=True)
-    turn, plain, split = (constant(_doubles, walls.device, *rows) for rows in _AXES)
-    unit = torch.cat([plain.expand(*along.shape[:2], 2, 2), ((along @ turn) / length.clamp_min(1e-9))[..., None, :]], 2)
+    length = torch.linalg.vector_norm(along, dim=-1, keepdim=True)
+    turn, plain, sides = (constant(_doubles, walls.device, *rows) for rows in (_QUARTER, _PLAIN, ((-1.0, 1.0),)))
+    across = (along @ turn) / length.masked_fill(length < 1e-9, torch.nan)
+    unit = torch.cat([plain.expand(*along.shape[:2], 2, 2), across[..., None, :]], 2)
+    onward = unit @ turn.mT
     both = unit @ ends.mT  # [B, S, 3 axes, 2 ends]
-    reach = half * unit.abs().sum(-1)
-    low, high = torch.aminmax(both, dim=-1)
-    crossing = (unit @ split @ unit.mT).abs()
-    return _Sides(unit, low - reach, high + reach, crossing, length[..., 0] >= 1e-9)
+    reach = torch.add(both.diff(dim=-1)[..., 0].abs(), torch.linalg.vector_norm(unit, 1, dim=-1), alpha=2 * half) / 2
+    middle = both.mean(-1)
+    grazing = (unit @ onward.mT).abs() > 0.02
+    near = where(grazing, (reach - WITHIN_M)[:, :, None].expand(grazing.shape), torch.inf)
+    # a box that moves along a wall that it touches does not run into it
+    ends = torch.addcmul(middle[..., None], (reach - 1e-9)[..., None], sides[0])
+    return _Sides(unit.flatten(1, 2), onward.flatten(1, 2), ends, middle, near)
 
 
 _QUARTER = (0.0, -1.0), (1.0, 0.0)
-_AXES = _QUARTER, ((1.0, 0.0), (0.0, 1.0)), _QUARTER
+_PLAIN = (1.0, 0.0), (0.0, 1.0)
 
 
 def _doubles(*rows) -> torch.Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
+def _firsts(count: int) -> torch.Tensor:
+    return 3 * torch.arange(count)
+
+
 def _first_touch(sides: _Sides, place: torch.Tensor, move: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The share [B, 1] of the move [B, 2] at which a box at `place` [B, 2] first touches a wall (2: none), and the direction [B, 2]
-    in which it can go on: see kernels_numba/walls.first_touch."""
-    unit, low, high, crossing, real = sides
-    at, speed = (unit @ torch.stack([place, move], -1)[:, None]).unbind(-1)  # [B, S, 3]
-    low, high, pace = low - at, high - at, speed.abs()
-    still = pace < 1e-12
-    ends = torch.stack([low, high]) / speed.masked_fill(still, 1.0)
-    least, most = torch.aminmax(ends, dim=0)
-    enter, face = least.masked_fill(still, -1e9).max(-1)
-    beside = still & (torch.maximum(low, -high) >= -1e-9)
-    leave = most.masked_fill(still, 1e9).masked_fill(beside, -1e9).amin(-1)
-    went = enter[..., None] * speed
-    deep = torch.minimum(went - low, high - went)
+    """The share [B, 1] of the move [B, 2] at which a box at `place` [B, 2] first touches a wall (more than 1: none), and the
+    direction [B, 2] in which it can go on: see kernels_numba/walls.first_touch."""
+    unit, onward, ends, middle, near = sides
+    at, speed = (unit @ torch.stack([place, move], -1)).view(*middle.shape, 2).unbind(-1)  # [B, S, 3]
+    # times from end to end along each axis; along one without speed always, or never
+    least, most = torch.aminmax((ends - at[..., None]) / speed[..., None], dim=-1)
+    enter, face = least.max(-1)
     index = face[..., None]
-    across = crossing.gather(2, index[..., None].expand(*crossing.shape[:2], 1, 3))[:, :, 0]
-    grazes = ((across > 0.02) & (deep < WITHIN_M)).any(-1)
-    reaches = (enter < leave) & (enter <= 1) & (enter > -1e9) & (enter * pace.gather(2, index)[..., 0] > -WITHIN_M)
-    share, which = where(reaches & real & ~grazes, enter, 2.0).min(1, keepdim=True)
-    faced = unit.flatten(1, 2).gather(1, (3 * which + face.gather(1, which))[..., None].expand(-1, -1, 2))[:, 0]
-    return share, faced @ constant(_doubles, place.device, *_QUARTER).mT
+    off = torch.addcmul(middle - at, enter[..., None], speed, value=-1).abs()
+    clear = (off <= near.gather(2, index[..., None].expand(-1, -1, 1, 3))[:, :, 0]).all(-1)
+    reaches = (enter < most.amin(-1)) & (enter * speed.abs().gather(2, index)[..., 0] > -WITHIN_M) & clear
+    share, which = where(reaches, enter, 2.0).min(1, keepdim=True)
+    faced = (face + constant(_firsts, place.device, face.shape[1])).gather(1, which)
+    return share, onward.gather(1, faced[..., None].expand(-1, -1, 2))[:, 0]
 
 
 def horizon(camera: Intrinsics, height: int) -> int:

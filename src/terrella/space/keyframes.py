@@ -10,14 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
-import torch.nn.functional as F
 
-from ..core.backend import constant, kernels_do, table
-from .camera import FAR_M, NEAR_M, SAME, Intrinsics, project, rotation, unproject
+from ..core.backend import constant, kernels_do, where
+from .camera import FAR_M, NEAR_M, SAME, Intrinsics, pixel_intrinsics, pixels_at, project, rotation, unproject
 from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
-from .patches import COARSE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
+from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
 from .reproject import fill_holes, warp
 from .views import arrays, over_views
 
@@ -77,7 +76,9 @@ class Keyframes:
 
 def doubled(rgb: torch.Tensor) -> torch.Tensor:
     """uint8 [..., 3, H, W] -> [..., 3, 2H, 2W], every pixel four times: a warp then blurs it by half a pixel only."""
-    return rgb.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    height, width = rgb.shape[-2:]
+    whole = rgb[..., None, :, None].expand(*rgb.shape[:-1], 2, width, 2)
+    return whole.reshape(*rgb.shape[:-2], 2 * height, 2 * width)
 
 
 def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple[Keyframes, torch.Tensor]:
@@ -108,7 +109,7 @@ class Glimpse:
 
 def merge(glimpse: Glimpse) -> torch.Tensor:
     """The colours averaged with the squared trust of the slots: [B, 3, H, W] in [0, 1]."""
-    weight = (glimpse.trust + 1e-4) ** 2
+    weight = (glimpse.trust + 1e-4).square()
     return (glimpse.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
 
 
@@ -145,42 +146,55 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
     middle = (camera[2] - off / width) / scale[0], (camera[3] - off / height) / scale[1]
     thinned = camera[0] / scale[0], camera[1] / scale[1], *middle
     coarse = torch.cat([shared.coarse.flatten(0, 1).expand(batch, -1, -1), own.coarse[rows].flatten(1, 2)], 1)
-    depths = cast(coarse, pose, thinned, grid, COARSE_CASTS)
-    points, depths = unproject(depths, pose, thinned).flatten(1, 2), depths.flatten(1)
-    known = constant(torch.arange, pose.device, len(shared)).expand(batch, -1)
-    votes = vote_slowly(((shared, known), (own, rows)), points, depths, camera)
-    votes = votes * F.pad(rows > 0, (len(shared), 0), value=True)[..., None]
-    numbers = torch.cat([known, (len(shared) + rows).masked_fill(rows <= 0, -1)], 1)
-    picks = pick_slowly(votes, count)
-    if not numbers.shape[1]:
-        return picks
-    lots = ((picks - len(shared)).clamp_min(-1) // kernels.LOT).masked_fill(picks < 0, count + numbers.shape[1])
-    picks = picks.gather(1, lots.argsort(dim=1, stable=True))
-    return numbers.gather(1, picks.clamp_min(0)).masked_fill(picks < 0, -1)
+    turn = rotation(pose)
+    depths = cast(coarse, pose, thinned, grid, COARSE_CASTS, turn)
+    points, depths = unproject(depths, pose, thinned, turn).flatten(1, 2), depths.flatten(1)
+    votes = vote_slowly(shared, own, rows, points, depths, camera)
+    if not votes.shape[1]:
+        return pick_slowly(votes, count)
+    picks = pick_slowly(votes, count)  # never row 0 of own ones, which is all zeros
+    order = constant(_lots, pose.device, len(shared), rows.shape[1])[picks].argsort(dim=1, stable=True)
+    known, none = (
+        constant(torch.tensor, pose.device, part).expand(batch, -1) for part in (tuple(range(len(shared))), (-1,))
+    )
+    numbers = torch.cat([known, len(shared) + rows, none], 1)
+    picks = picks.gather(1, order)
+    return numbers[constant(torch.arange, pose.device, batch)[:, None], picks]  # the pick -1 is the last number
+
+
+def _lots(shared: int, own: int) -> torch.Tensor:
+    """In which order keyframes that are trusted alike show: shared ones first, then own ones, LOT of their slots after the other;
+    last the pick -1, none."""
+    return torch.cat([torch.full((shared,), -1), torch.arange(own) // kernels.LOT, torch.tensor([own])])
 
 
 def vote_slowly(
-    keyframes: Sequence[tuple[Keyframes, torch.Tensor]],
+    shared: Keyframes | None,
+    own: Keyframes,
+    rows: torch.Tensor,
     points: torch.Tensor,
-    distance: torch.Tensor,
+    distance: torch.Tensor | None,
     camera: Intrinsics,
 ) -> torch.Tensor:
-    """Votes [B, n, P] of keyframes, given by sets and rows [B, k] in them, for points [B, P, 3] that lie `distance` [B, P] deep in
-    a view."""
-    height, width = keyframes[0][0].depth.shape[-2:]
-    where, ahead = project(points[:, None], torch.cat([keys.pose[rows] for keys, rows in keyframes], 1), camera)
-    pixel = (where * constant(table, points.device, width, height)).clamp_min(0).nan_to_num(0.0)
-    pixel = torch.minimum(pixel, constant(table, points.device, width - 1, height - 1)).long()
-    pixel = torch.add(pixel[..., 0], pixel[..., 1], alpha=width)
-    parts = pixel.split([rows.shape[1] for _, rows in keyframes], 1)
-    held = [
-        keys.depth.flatten()[rows[..., None] * (height * width) + part] for (keys, rows), part in zip(keyframes, parts)
-    ]
-    near = ahead.clamp_min(NEAR_M)
-    seen = ((where - 0.5).abs() < 0.5).all(-1) & (ahead > NEAR_M) & (distance < FAR_M)[:, None]
-    same = seen & ((torch.cat(held, 1) - ahead).abs() < SAME * ahead)
-    ratio = distance[:, None] / near
-    return torch.minimum(ratio, near / distance.clamp_min(1e-9)[:, None]) * same
+    """Votes [B, n, P] of shared keyframes and of the `rows` [B, k] of own ones, for points [B, P, 3] that lie `distance` [B, P]
+    deep in a view; without it the points are of the own keyframes, as many of each, and as deep as they lie in these."""
+    batch, size = len(points), (own if shared is None else shared).depth.shape[-2:]
+    poses, turns = own.pose[rows], own.turn[rows]
+    if shared is not None:
+        poses = torch.cat([shared.pose.expand(batch, -1, -1), poses], 1)
+        turns = torch.cat([shared.turn.expand(batch, -1, -1, -1), turns], 1)
+    at, ahead = project(points[:, None], poses, pixel_intrinsics(camera, size), turns)
+    pixel, inside = pixels_at(at, size)
+    pixel, mine = pixel.split([pixel.shape[1] - rows.shape[1], rows.shape[1]], 1)
+    held = own.depth.flatten()[torch.add(mine, rows[..., None], alpha=size[0] * size[1])]
+    if shared is not None:
+        held = torch.cat([shared.depth.flatten(1).expand(batch, -1, -1).gather(2, pixel), held], 1)
+    if distance is None:
+        distance = ahead.unflatten(2, (rows.shape[1], -1)).diagonal(dim1=1, dim2=2).mT.flatten(1)
+    seen = inside & (distance < FAR_M)[:, None]
+    same = seen & ((held - ahead).abs() < SAME * ahead)
+    ratio = distance[:, None] / ahead.clamp_min(NEAR_M)
+    return torch.minimum(ratio, ratio.reciprocal()) * same
 
 
 def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
@@ -231,38 +245,45 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
         nothing = pose.new_zeros(batch, slots, 3, *size)
         return Glimpse(nothing, nothing[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
 
+    theirs, ours = picks.clamp(0, max(0, len(shared) - 1)), (picks - len(shared)).clamp_min(0)
+
     def both(part: str, change: Callable[[torch.Tensor], torch.Tensor] = lambda tensor: tensor) -> torch.Tensor:
         """[B, S, ...]: that part of the picked keyframes, after `change` for own ones."""
         first, second = getattr(shared, part), getattr(own, part)
         if not len(own):
-            return first[picks.clamp_min(0)]
-        ours = change(second[torch.where(mine, picks - len(shared), 0)])
-        if not len(shared):
-            return ours
-        flags = mine.view(*mine.shape, *[1] * (first.ndim - 1))
-        return torch.where(flags, ours, first[torch.where(mine, 0, picks.clamp_min(0))])
+            return first[theirs]
+        own_part = change(second[ours])
+        return chosen(own_part, first) if len(shared) else own_part
 
-    key_depth, poses, rgb = both("depth"), both("pose"), both("rgb", doubled) / 255
-    patch = patches_slowly(key_depth, poses, camera, FINE)
+    def chosen(own_part: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
+        return torch.where(mine.view(*mine.shape, *[1] * (first.ndim - 1)), own_part, first[theirs])
+
+    key_depth, poses, turns, rgb = both("depth"), both("pose"), both("turn"), both("rgb", doubled) / 255
+    patch, turn = patches_slowly(key_depth, poses, camera, FINE, turns), rotation(pose)
     if len(shared):
-        patch = torch.where(mine[..., None, None], patch, shared.fine[torch.where(mine, 0, picks.clamp_min(0))])
+        patch = chosen(patch, shared.fine)
     patch = patch * valid[..., None, None]
-    depth = cast(patch.flatten(1, 2), pose, camera, size)
+    depth = cast(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
     hit = depth < FAR_M
     depth = fill_holes(depth)
-    colours, trust = recall_slowly(rgb, key_depth, poses, valid, depth, pose, camera, slots)
+    keys = rgb, key_depth, poses, turns
+    colours, trust = recall_slowly(keys, valid, depth, (pose, turn), camera, slots)
     return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 
 
-def recall_slowly(rgb, depth, poses, valid, seen, pose, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most trusted colours [B, slots, 3, H, W] of the surfaces at depth `seen` [B, H, W] from `pose` [B, 7], and their trust
-    [B, slots, H, W]: from keyframes rgb [B, S, 3, h, w] in [0, 1], depth [B, S, h, w], poses [B, S, 7], valid [B, S]."""
-    colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera)
-    likeness = torch.minimum(closeness, 1 / closeness.clamp_min(1e-3)).clamp_min(0.05)
-    sure = torch.where(valid[..., None, None], agreement * likeness**2, -1.0)
+def recall_slowly(keys, valid, seen, view, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
+    """The most trusted colours [B, slots, 3, H, W] of the surfaces at depth `seen` [B, H, W] in a view = pose [B, 7] and rotation
+    [B, 3, 3], and their trust [B, slots, H, W]; keys: keyframes' rgb [B, S, 3, h, w] in [0, 1], depth [B, S, h, w], poses
+    [B, S, 7] and rotations [B, S, 3, 3], `valid` [B, S]."""
+    (rgb, depth, poses, turns), (pose, turn) = keys, view
+    colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera, turns, turn)
+    likeness = torch.minimum(closeness, closeness.clamp_min(1e-3).reciprocal()).clamp_min(0.05)
+    sure = where(valid[..., None, None], agreement * likeness.square(), -1.0)
     # of equals the first, as the kernel does
     best, order = (part[:, :slots] for part in sure.sort(dim=1, descending=True, stable=True))
-    shown = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]
-    missing = slots - best.shape[1]
-    colours = torch.cat([shown, shown.new_zeros(len(shown), missing, *shown.shape[2:])], 1)
-    return colours, torch.cat([best.clamp_min(0), best.new_zeros(len(best), missing, *best.shape[2:])], 1)
+    colours = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]
+    trust, missing = best.clamp_min(0), slots - best.shape[1]
+    if not missing:
+        return colours, trust
+    colours = torch.cat([colours, colours.new_zeros(len(colours), missing, *colours.shape[2:])], 1)
+    return colours, torch.cat([trust, trust.new_zeros(len(trust), missing, *trust.shape[2:])], 1)

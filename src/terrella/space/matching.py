@@ -4,38 +4,42 @@ import torch
 
 from ..core.backend import constant, kernels_do
 from .kernels_numba.matching import edge_shares as edge_shares_kernel
+from .mosaic import displaced
 from .views import arrays, each_view
 
 SAME, TEXTURED = 16, 12  # differences of 255: of one pixel in two pictures, and of neighbours in one
 
 
 def edge_shares(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
-    """The share of the edges of `after` that each move brings from `before` (uint8 [B, 3, H, W]): 0..1 [B, M], from every second
-    pixel with its neighbours above and to the left."""
+    """The share of the edges of `after` that each move brings from `before` (uint8 [..., 3, H, W]): 0..1 [..., M], from every
+    second pixel with its neighbours above and to the left."""
     if not kernels_do(before):
         return edge_shares_slowly(before, after, moves)
-    shares = torch.empty(len(after), len(moves))
-    each_view(edge_shares_kernel, arrays(before, after, shares), *arrays(moves), SAME, TEXTURED)
-    return shares
+    pictures = [part.flatten(0, -4) if part.ndim > 4 else part for part in (before, after)]
+    shares = torch.empty(len(pictures[0]), len(moves))
+    each_view(edge_shares_kernel, arrays(*pictures, shares), *arrays(moves), SAME, TEXTURED)
+    return shares.view(*after.shape[:-3], len(moves))
 
 
 def edge_shares_slowly(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The same as `edge_shares`, in plain tensor algebra, also for GPUs."""
-    height, width = after.shape[-2:]
-    one, other = before.int(), after.int()
-    corner = other[..., 1:, 1:]
-    steps = (corner - other[..., :-1, 1:]).abs(), (corner - other[..., 1:, :-1]).abs()
-    edges = (torch.maximum(*steps).amax(1) > TEXTURED)[:, ::2, ::2].flatten(1)
-    x = constant(torch.arange, after.device, width) - moves[:, :1]
-    y = constant(torch.arange, after.device, height) - moves[:, 1:]
-    shifted = one[:, :, y.clamp(0, height - 1)[:, :, None], x.clamp(0, width - 1)[:, None]]  # [B, 3, M, H, W]
-    off = (shifted - other[:, :, None]).abs().amax(1)
-    off = torch.maximum(torch.maximum(off[..., 1:, 1:], off[..., :-1, 1:]), off[..., 1:, :-1])[..., ::2, ::2]
-    inside = ((y[:, 1::2] >= 1) & (y[:, 1::2] < height))[:, :, None] & ((x[:, 1::2] >= 1) & (x[:, 1::2] < width))[
-        :, None
-    ]
-    same = ((off <= SAME) & inside).flatten(2) & edges[:, None]
-    return same.sum(2) / edges.sum(1, keepdim=True).clamp_min(1)
+    size = after.shape[-2:]
+    corners = constant(_corners, after.device, *size)
+    now = after.flatten(-2)[..., corners].int()  # [..., 3, corner, n]
+    edges = (now[..., 1:, :] - now[..., :1, :]).abs().amax((-3, -2)) > TEXTURED
+    place, rows, columns = displaced(moves, size, size)
+    was = before.flatten(-2)[..., place.flatten(1)[:, corners]]  # [..., 3, M, corner, n]
+    off = (was - now[..., None, :, :]).abs().amax((-4, -2))
+    rows, columns = (part[:, 1::2] & part[:, :-1:2] for part in (rows, columns))
+    inside = (rows[..., None] & columns[:, None]).flatten(1)
+    same = (off <= SAME) & inside & edges[..., None, :]
+    return same.sum(-1) / edges.sum(-1, keepdim=True).clamp_min(1)
+
+
+def _corners(height: int, width: int) -> torch.Tensor:
+    """int64 [3, n]: every second pixel, those above, and those to the left."""
+    pixels = torch.arange(1, height, 2)[:, None] * width + torch.arange(1, width, 2)
+    return torch.stack([pixels.flatten() - step for step in (0, width, 1)])
 
 
 def scroll_index(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 
 from ..core.arena import Arena
-from ..core.backend import kernels_do
+from ..core.backend import constant, kernels_do, where
 from ..core.errors import ContractError
 from ..core.state import State
 from .camera import Intrinsics, yaw
@@ -134,71 +134,82 @@ class Memory:
         far, turn = self.new_view
         here, kept = pose[:, None], held["memory_pose"]
         away = (kept[..., :3] - here[..., :3]).norm(dim=-1) / far
-        angle = yaw(kept) - yaw(here)
+        headings = yaw(torch.cat([here, kept], 1))
+        angle = headings[:, 1:] - headings[:, :1]
         apart = away + torch.atan2(angle.sin(), angle.cos()).abs() / turn
-        return torch.where(held["memory_kind"] > EMPTY, apart, torch.inf).min(1)
+        return where(held["memory_kind"] > EMPTY, apart, torch.inf).min(1)
 
     def _keep(self, held: Held, kind: int, rgb, depth, pose, which: torch.Tensor) -> dict[str, torch.Tensor]:
         if not self.capacity:
             return {}
         apart, nearest = self.nearest(held, pose)
-        which = which if kind == OBSERVED else which & (apart > 1)
-        views = torch.arange(len(pose), device=pose.device)
+        new = apart > 1
+        which = which if kind == OBSERVED else which & new
+        parts = held["memory_kind"], held["memory_born"], held[ROWS], apart, nearest, new, rgb, depth, pose
+        views = None
         if kernels_do(pose):  # elsewhere it costs less to write all rows than to ask how many there are
             views = which.nonzero()[:, 0]
             if not len(views):
                 return {}
-        apart, nearest, pose = apart[views], nearest[views], pose[views]
-        new = Keyframes.of(rgb[views], depth[views], pose, self.camera, fine=False)
+            parts = tuple(part[views] for part in parts)
+        kinds, born, rows, _, nearest, new, rgb, depth, pose = parts
+        made = Keyframes.of(rgb, depth, pose, self.camera, fine=False)
         arena = self._arena_of(held)
-        slot = torch.where(apart <= 1, nearest, self._room(held, views, apart > 1))
-        rows = arena.keep({name: vars(new)[name] for name in arena.parts})
+        slot = torch.where(new, self._room(held, kinds, born, rows, new), nearest)
+        rows = arena.keep({name: vars(made)[name] for name in arena.parts})
         fresh = {
-            "memory_pose": pose, "memory_kind": torch.full_like(slot, kind, dtype=torch.uint8),
-            "memory_born": held["memory_born"][views].amax(1) + 1, ROWS: rows,
+            "memory_pose": pose, "memory_kind": constant(_kind, pose.device, kind).expand(len(slot)),
+            "memory_born": born.amax(1) + 1, ROWS: rows,
         }  # fmt: skip
-        flags = which[views]
-        changed = {}
-        for name, value in fresh.items():
-            value = torch.where(flags.view(-1, *[1] * (value.ndim - 1)), value, held[name][views, slot])
-            changed[name] = held[name].index_put((views, slot), value)
+        if views is not None:
+            changed = {name: held[name].index_put((views, slot), value) for name, value in fresh.items()}
+        else:
+            here = (constant(torch.arange, pose.device, self.capacity) == slot[:, None]) & which[:, None]
+            changed = {
+                name: torch.where(here if value.ndim == 1 else here[..., None], value[:, None], held[name])
+                for name, value in fresh.items()
+            }
         arena.hold(changed[ROWS])
         return changed
 
-    def _room(self, held: Held, views: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """A slot for a new keyframe of each of `views` [n]: a free one or, where `wanted` [n], that of the keyframe to drop."""
-        kind, born = held["memory_kind"][views], held["memory_born"][views]
+    def _room(
+        self, held: Held, kind: torch.Tensor, born: torch.Tensor, rows: torch.Tensor, wanted: torch.Tensor
+    ) -> torch.Tensor:
+        """A slot for a new keyframe of each of n memories, of which kind, born and rows [n, capacity] are the tensors: a free one
+        or, where `wanted` [n], that of the keyframe to drop."""
         lowest, slot = kind.min(1)  # EMPTY is the lowest kind
         full = wanted & (lowest != EMPTY)
-        if kernels_do(kind) and not full.any():
-            return slot
-        some = full.nonzero()[:, 0] if kernels_do(kind) else torch.arange(len(views), device=kind.device)
-        covered = self.covered(held, views[some])
+        some = None
+        if kernels_do(kind):
+            some = full.nonzero()[:, 0]
+            if not len(some):
+                return slot
+            kind, born, rows = kind[some], born[some], rows[some]
+        dreamt = kind == DREAMT
+        covered = self.covered(held, rows, dreamt)
         best = covered > covered.amax(1, keepdim=True) - _ALIKE
-        age = torch.where(kind[some] == DREAMT, born[some], born[some] + 2**62)
-        forgotten = torch.where(best, age, 2**63 - 1).argmin(1)
-        return slot.index_put((some,), torch.where(full[some], forgotten, slot[some]))
+        age = torch.where(dreamt, born, born + 2**62)
+        forgotten = where(best, age, 2**63 - 1).argmin(1)
+        return torch.where(full, forgotten, slot) if some is None else slot.index_put((some,), forgotten)
 
-    def covered(self, held: Held, views: torch.Tensor) -> torch.Tensor:
-        """The share [n, capacity] of the view of each keyframe that others cover, in full memories `views` [n]: the mean over
-        points of its surfaces of the best vote of another keyframe."""
-        rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
+    def covered(self, held: Held, rows: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
+        """The share [n, capacity] of the view of each keyframe that others cover, in full memories whose keyframes are `rows`
+        [n, capacity], imagined ones where `dreamt` [n, capacity]: the mean over points of its surfaces of the best vote of
+        another keyframe."""
         if not kernels_do(rows):
-            return self.covered_slowly(held, views)
+            return self.covered_slowly(held, rows, dreamt)
         keys, share = self._keyframes(held), torch.zeros(rows.shape)
         given = arrays(keys.coarse, keys.depth, keys.turn, keys.pose, rows, dreamt)
         parts = [*given, self.camera, _EVERY, share.numpy()]
-        over_views(len(views), lambda first, last: kernels.covered(first, last, *parts))
+        over_views(len(rows), lambda first, last: kernels.covered(first, last, *parts))
         return share
 
-    def covered_slowly(self, held: Held, views: torch.Tensor) -> torch.Tensor:
+    def covered_slowly(self, held: Held, rows: torch.Tensor, dreamt: torch.Tensor) -> torch.Tensor:
         """The same as `covered`, in plain tensor algebra, also for GPUs."""
-        rows, dreamt = held[ROWS][views], held["memory_kind"][views] == DREAMT
         keys, count = self._keyframes(held), self.capacity
-        points, pose = keys.coarse[rows][:, :, ::_EVERY, :3], keys.pose[rows]
-        distance = ((points - pose[..., None, :3]) * keys.turn[rows][:, :, None, :, 0]).sum(-1)
-        votes = vote_slowly([(keys, rows)], points.flatten(1, 2), distance.flatten(1), self.camera)
-        others = ~torch.eye(count, dtype=torch.bool, device=rows.device) & (dreamt[:, None, :] | ~dreamt[:, :, None])
+        points = keys.coarse[:, ::_EVERY, :3][rows].flatten(1, 2)
+        votes = vote_slowly(None, keys, rows, points, None, self.camera)
+        others = (dreamt[:, None, :] >= dreamt[:, :, None]) > constant(_itself, rows.device, count)
         return (votes.unflatten(2, (count, -1)) * others[..., None]).amax(1).mean(2)
 
     # -- recalling ----------------------------------------------------------------------------------------------------
@@ -210,9 +221,8 @@ class Memory:
     def walls(self, held: Held, dreamt: bool = True) -> torch.Tensor:
         """The walls [B, n, 4] in the keyframes (floorplan.py), NOWHERE in empty rows; `dreamt`: with imagined keyframes."""
         rows, kind = held[ROWS], held["memory_kind"]
-        counts = (kind > EMPTY) & ((kind != DREAMT) | dreamt)
-        walls = self._arena_of(held).read("walls")[rows]
-        return torch.where(counts[..., None, None], walls, NOWHERE).flatten(1, 2)
+        counts = kind > EMPTY if dreamt else (kind > EMPTY) & (kind != DREAMT)
+        return where(counts[..., None, None], self._arena_of(held).read("walls")[rows], NOWHERE).flatten(1, 2)
 
     def look(
         self, held: Held, pose: torch.Tensor, sources: int = 6, slots: int = 3, recorded: Keyframes | None = None
@@ -223,9 +233,6 @@ class Memory:
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)
         picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
-        # with equal trust, a recorded one comes first
-        turn = torch.where(picks < 0, 2, (picks >= len(shared)).long())
-        picks = picks.gather(1, turn.argsort(dim=1, stable=True))
         return look(shared, picks, pose, self.camera, self.size, slots, own)
 
     def _arena_of(self, held: Held) -> Arena:
@@ -235,10 +242,18 @@ class Memory:
         """All rows of the arena, without fine patches; nothing is copied."""
         arena = self._arena_of(held)
         parts = {name: arena.read(name) for name in arena.parts}
-        return Keyframes(fine=parts["depth"].new_zeros(len(parts["depth"]), 0, 9), **parts)
+        return Keyframes(fine=parts["coarse"][:, :0], **parts)
 
 
 def keyframe_table(pose: torch.Tensor, kind: torch.Tensor) -> torch.Tensor:
     """float32 [..., 4] = x, y in metres, heading in radians, kind, from poses [..., 7] and kinds [...]; zeros in empty slots."""
     row = torch.cat([pose[..., :2], yaw(pose)[..., None], kind[..., None].float()], -1)
     return torch.where((kind > EMPTY)[..., None], row, 0.0)
+
+
+def _kind(number: int) -> torch.Tensor:
+    return torch.tensor(number, dtype=torch.uint8)
+
+
+def _itself(count: int) -> torch.Tensor:
+    return torch.eye(count, dtype=torch.bool)

@@ -35,13 +35,13 @@ def update_mosaic_slowly(
     after = _window(mosaic, move, mosaic.shape[-2:])
     top, left = middle(mosaic, size)
     seen = after[..., top : top + size[0], left : left + size[1]]
-    votes = seen[:, 3:].int()
-    same = (seen[:, :3].int() - frame.int()).abs().amax(1, keepdim=True) <= SAME
-    agree, outvoted = same & (votes > 0), votes > 1
-    colour = torch.where(agree | outvoted, seen[:, :3], frame)
-    votes = torch.where(agree, (votes + 1).clamp_max(MOST), torch.where(outvoted, votes - 1, 1))
-    joined = torch.where(over, seen, torch.cat([colour, votes.to(torch.uint8)], 1))
-    after[..., top : top + size[0], left : left + size[1]] = joined
+    whole = seen.int()
+    votes = whole[:, 3:]
+    same = (whole[:, :3] - frame).abs().amax(1, keepdim=True) <= SAME
+    agree = same & (votes > 0)
+    colour = torch.where(agree | (votes > 1), whole[:, :3], frame)
+    votes = torch.where(agree, (votes + 1).clamp_max(MOST), (votes - 1).clamp_min(1))  # outvoted, or of a new colour
+    after[..., top : top + size[0], left : left + size[1]] = torch.where(over, whole, torch.cat([colour, votes], 1))
     return after
 
 
@@ -53,15 +53,35 @@ def read_mosaic(mosaic: torch.Tensor, size: tuple[int, int], move: torch.Tensor)
 
 def _window(mosaic: torch.Tensor, move: torch.Tensor, size) -> torch.Tensor:
     """The middle `size` of mosaics displaced by `move`."""
-    tall, wide = mosaic.shape[-2:]
-    top, left = middle(mosaic, size)
-    y = constant(torch.arange, mosaic.device, top, top + size[0]) - move[:, 1:]
-    x = constant(torch.arange, mosaic.device, left, left + size[1]) - move[:, :1]
-    near_y, near_x = y.clamp(0, tall - 1), x.clamp(0, wide - 1)
-    inside = (y == near_y)[:, :, None] & (x == near_x)[:, None]
-    place = near_y[:, :, None] * wide + near_x[:, None]
+    place, rows, columns = displaced(move, mosaic.shape[-2:], size, middle(mosaic, size))
     window = mosaic.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 4, -1)).unflatten(2, tuple(size))
-    return window * inside[:, None]
+    return window * (rows[..., None] & columns[:, None])[:, None]
+
+
+def displaced(
+    move: torch.Tensor, whole: tuple[int, int], size: tuple[int, int], corner: tuple[int, int] = (0, 0)
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where the pixels of windows of `size`, at `corner` (row and column) of `whole` pictures, come from if these went on by `move`
+    int64 [n, 2] = x, y: the pixels int64 [n, H, W], counted along rows, or the nearest; and which rows [n, H] and which columns
+    [n, W] come from inside."""
+    place = constant(_lines, move.device, tuple(size), tuple(corner)) - move[:, None]  # [n, line, column or row]
+    near = torch.clamp(place, *constant(_ends, move.device, tuple(whole)).unbind(0))
+    inside, columns, rows = place == near, near[:, : size[1], 0], near[:, : size[0], 1]
+    return (
+        torch.add(columns[:, None], rows[..., None], alpha=whole[1]),
+        inside[:, : size[0], 1],
+        inside[:, : size[1], 0],
+    )
+
+
+def _lines(size: tuple[int, int], corner: tuple[int, int]) -> torch.Tensor:
+    """int64 [n, 2]: the columns and the rows of a window, as many of both."""
+    return torch.arange(max(size))[:, None] + torch.tensor(corner[::-1])
+
+
+def _ends(whole: tuple[int, int]) -> torch.Tensor:
+    """int64 [2, 2]: the first and the last column and row."""
+    return torch.tensor([[0, 0], [whole[1] - 1, whole[0] - 1]])
 
 
 def middle(mosaic: torch.Tensor, size) -> tuple[int, int]:

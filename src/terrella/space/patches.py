@@ -3,6 +3,7 @@ So slanted and very near surfaces have exact depth without holes. On a CPU, kern
 also run on GPUs."""
 
 import torch
+import torch.nn.functional as F
 
 from ..core.backend import constant, kernels_do, table, where
 from .camera import FAR_M, NEAR_M, Intrinsics, rotation, unproject
@@ -11,8 +12,8 @@ from .views import arrays, each_view
 
 # Steps of a cast: of how many patches, those of the largest pictures, how many pixels are tried. In doom-maze some 5,500 of
 # 156,000 coarse patches are in view; of 18,000 fine ones 2,000 fill more than 16 pixels, 50 more than 256.
-COARSE_CASTS = (16384, 4), (1024, 64), (256, 10**9)
-FINE_CASTS = (10**9, 16), (4096, 256), (512, 10**9)
+COARSE_CASTS = (16384, 4), (1024, 10**9)
+FINE_CASTS = (10**9, 128), (512, 10**9)
 SLANT = 6.0  # patches longer than this many times those of a wall seen head-on are no surface
 
 
@@ -39,84 +40,104 @@ def patch_count(size: tuple[int, int], stride: int) -> int:
     return len(range(stride // 2, size[0], stride)) * len(range(stride // 2, size[1], stride))
 
 
-def patches_slowly(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int) -> torch.Tensor:
-    """The same as `patches`, in plain tensor algebra, also for GPUs."""
-    points = unproject(depth, pose, camera)
-    across, down = _shorter_difference(points, -2), _shorter_difference(points, -3)
+def patches_slowly(
+    depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, stride: int, turn: torch.Tensor | None = None
+) -> torch.Tensor:
+    """The same as `patches`, in plain tensor algebra, also for GPUs; `turn` [..., 3, 3]: the rotations of the poses."""
+    points, (height, width) = unproject(depth, pose, camera, turn), depth.shape[-2:]
+    kept, images = (..., *[slice(stride // 2, None, stride)] * 2), depth.reshape(-1, height * width)
+    begin, end = (constant(_steps, depth.device, height, width, stride, step) for step in (0, 1))
+    lines = points.view(-1, height * width, 3)
+    steps = (lines[:, end] - lines[:, begin]).view(
+        *depth.shape[:-2], *begin.shape, 3
+    )  # [..., h, w, axis, before or after, 3]
+    long = torch.linalg.vector_norm(steps, dim=-1)
+    sides = torch.where((long[..., 0] < long[..., 1])[..., None], steps[..., 0, :], steps[..., 1, :])
+    flat = _is_flat(images, height, width, stride).view(*depth.shape[:-2], *begin.shape[:2])
+    reach = where(flat, constant(torch.tensor, depth.device, 0.75 * stride), 0.5)
+    reach = reach * (long.amin(-1).amax(-1) <= depth[kept] * (SLANT / (camera[0] * width)))
+    whole = torch.cat([points[(*kept, slice(None))], (reach[..., None, None] * sides).flatten(-2)], -1)
+    return whole.flatten(-3, -2)
+
+
+def _steps(height: int, width: int, stride: int, end: int) -> torch.Tensor:
+    """int64 [h, w, 2, 2]: the pixels from which (end = 0), or to which (1), the steps before and after a patch's pixel lead, to
+    the right and down. At a rim both are the one that there is."""
+    first, before = stride // 2, torch.tensor([-1, 0])
+    rows, columns = torch.arange(first, height, stride)[:, None, None], torch.arange(first, width, stride)[:, None]
+    right = rows * width + (columns + before).clamp(0, width - 2) + end
+    down = ((rows + before).clamp(0, height - 2) + end) * width + columns
+    return torch.stack([right, down], 2)
+
+
+def _is_flat(images: torch.Tensor, height: int, width: int, stride: int) -> torch.Tensor:
+    """True where 1 / depth is a plane out to a patch's rim, as on any flat surface: of depth images [K, H W], bool [K, n] for each
+    patch."""
+    around, middle = (constant(make, images.device, height, width, stride) for make in (_around, _middles))
+    inverse = images.clamp_min(NEAR_M).reciprocal()
+    images = inverse[:, middle]
+    bend = torch.sub(inverse[:, around].sum(1), images[:, None], alpha=2)
+    return torch.linalg.vector_norm(bend, torch.inf, dim=1) < 0.05 * images
+
+
+def _middles(height: int, width: int, stride: int) -> torch.Tensor:
+    """int64 [n]: the pixels of patches."""
     first = stride // 2
-    reach = where(_is_flat(depth, stride), constant(torch.tensor, depth.device, 0.75 * stride), 0.5)[..., None]
-    head_on = depth[..., None] / (camera[0] * depth.shape[-1])
-    longest = torch.maximum(across.norm(dim=-1, keepdim=True), down.norm(dim=-1, keepdim=True))
-    reach = reach * (longest <= SLANT * head_on)
-    whole = torch.cat([points, reach * across, reach * down], -1)
-    return whole[..., first::stride, first::stride, :].flatten(-3, -2)
+    return (torch.arange(first, height, stride)[:, None] * width + torch.arange(first, width, stride)).flatten()
 
 
-def _shorter_difference(points: torch.Tensor, axis: int) -> torch.Tensor:
-    """The shorter of the backward and the forward difference along `axis`, which stays on one surface."""
-    count = points.shape[axis]
-    step = points.diff(dim=axis).index_select(axis, constant(_clamped, points.device, count - 1, 1))
-    long = step.square().sum(-1, keepdim=True)
-    before, after = (lambda part: part.narrow(axis, 0, count)), (lambda part: part.narrow(axis, 1, count))
-    return torch.where(before(long) < after(long), before(step), after(step))
-
-
-def _is_flat(depth: torch.Tensor, stride: int) -> torch.Tensor:
-    """True where 1 / depth is a plane out to a patch's rim, as on any flat surface: [..., H, W]."""
-    inverse = 1 / depth.clamp_min(NEAR_M)
-    rim = max(1, round(0.75 * stride))
-    height, width = depth.shape[-2:]
-    images = inverse.reshape(-1, height, width)
-    rows, columns = (constant(_clamped, depth.device, length, rim) for length in (height, width))
-    padded = images.index_select(1, rows).index_select(2, columns)
-    around = ((0, rim), (rim, 0), (rim, rim), (rim, -rim))
-    ahead = torch.stack([padded[:, rim + v : rim + v + height, rim + u : rim + u + width] for v, u in around])
-    behind = torch.stack([padded[:, rim - v : rim - v + height, rim - u : rim - u + width] for v, u in around])
-    bend = (ahead + behind - 2 * images).abs().amax(0)
-    return (bend < 0.05 * images).view(depth.shape)
-
-
-def _clamped(length: int, rim: int) -> torch.Tensor:
-    """Indices of `length` pixels and of `rim` more at both ends, which repeat the outermost."""
-    return torch.arange(-rim, length + rim).clamp(0, length - 1)
+def _around(height: int, width: int, stride: int) -> torch.Tensor:
+    """int64 [2, 4, n]: the pixels at the rims of patches, opposite ones in pairs; at the picture's rim its own."""
+    middles, rim = _middles(height, width, stride), max(1, round(0.75 * stride))
+    steps = rim * torch.tensor([[0, 1], [1, 0], [1, 1], [1, -1]])[:, :, None]
+    ways = torch.stack([steps, -steps])
+    rows, columns = middles // width + ways[:, :, 0], middles % width + ways[:, :, 1]
+    return rows.clamp(0, height - 1) * width + columns.clamp(0, width - 1)
 
 
 def cast(
-    patch: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], steps=FINE_CASTS
+    patch: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+    size: tuple[int, int],
+    steps=FINE_CASTS,
+    turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """Depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], FAR_M where there is none: in plain tensor algebra, for all devices.
+    """Depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], whose rotations are `turn` [B, 3, 3], FAR_M where there is none: in
+    plain tensor algebra, for all devices.
 
     Patches are tried at the first pixels of the boxes around their pictures, in `steps` of fixed sizes, so that no shape depends on
     a value: few pixels of all, more of the largest, all of the very largest. What does not fit is left out."""
     batch, count = patch.shape[:2]
     height, width = size
-    rays_, signs = (constant(table, patch.device, *rows) for rows in (_ray_of_pixel(camera, size), _CORNERS))
-    turned = torch.cat([patch[..., :3] - pose[:, None, :3], patch[..., 3:]], -1).view(batch, -1, 3) @ rotation(pose)
-    sides = turned.view(batch, count, 3, 3)
-    centre, across, down = sides.unbind(2)
-    normal = torch.linalg.cross(down, across)
+    rays_, signs, pixels, middle, limits = (
+        constant(table, patch.device, *rows)
+        for rows in (_ray_of_pixel(camera, size), _CORNERS, *_pixels_of_camera(camera, size))
+    )
+    apart = patch - F.pad(pose[:, None, :3], (0, 6))
+    turn = rotation(pose) if turn is None else turn
+    sides = (apart.view(batch, -1, 3) @ turn).view(batch, count, 3, 3)  # centre, across, down
     # a ray meets the plane at centre + s across + t down: the depth, s and t by Cramer's rule are ratios of such products
     # with the ray of a pixel, which is linear in its column and row
-    products = torch.stack([normal, torch.linalg.cross(centre, down), torch.linalg.cross(across, centre)], 2) @ rays_
-    lift = (normal * centre).sum(-1)
-    corners = signs @ sides
-    ahead = corners[..., :1].clamp_min(NEAR_M)
-    focal, middle = (constant(table, patch.device, *pair) for pair in _pixels_of_camera(camera, size))
-    places = middle - focal * corners[..., 1:] / ahead
-    limits = constant(table, patch.device, width, height)
-    first = places.amin(2).ceil().clamp_min(0)
-    shape = torch.minimum(places.amax(2).floor() + 1, limits) - first
-    seen = (shape.amin(-1) > 0) & (lift < 0) & (centre[..., 0] > NEAR_M)
-    area = shape.prod(-1) * seen
-    anchored = products[..., 0] + (products[..., 1:] * first[..., None, :]).sum(-1)
-    start = first[..., 1:] * width + first[..., :1]
-    boxes = torch.cat([anchored, products.flatten(2), lift[..., None], start, shape[..., :1], area[..., None]], -1)
+    one, other = (constant(torch.tensor, patch.device, order) for order in ((1, 0, 1), (2, 2, 0)))
+    normals = torch.linalg.cross(sides.index_select(2, one), sides.index_select(2, other))
+    products = normals @ rays_
+    lift = (normals[:, :, 0] * sides[:, :, 0]).sum(-1)
+    corners = signs @ sides @ pixels
+    places = torch.addcdiv(middle, corners[..., 1:], corners[..., :1].clamp_min(NEAR_M))
+    ends = torch.maximum(places.amin(2).ceil(), limits)  # the first column and row, and minus those after the last
+    column, row, shape = ends[..., 0], ends[..., 1], -(ends[..., :2] + ends[..., 2:])
+    area = shape.clamp_min(0).prod(-1) * ((lift > 0) & (sides[:, :, 0, 0] > NEAR_M))
+    along = torch.addcmul(products[..., 0], products[..., 1], column[..., None])
+    anchored, start = torch.addcmul(along, products[..., 2], row[..., None]), torch.add(column, row, alpha=width)
+    single = [part[..., None] for part in (lift, start, shape[..., 0], area)]
+    boxes = torch.cat([anchored, products.flatten(2), *single], -1)
     canvas = pose.new_full((batch, height * width + 1), FAR_M)
     most = max((many for many, _ in steps if many < count), default=0)
     largest = area.topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
-    for many, pixels in steps:
+    for many, tried in steps:
         part = boxes if many >= count else boxes.gather(1, largest[:, :many])
-        _cast_boxes(part, width, min(pixels, height * width), canvas)
+        _cast_boxes(part, width, min(tried, height * width), canvas)
     return canvas[:, :-1].view(batch, height, width)
 
 
@@ -124,14 +145,14 @@ def _cast_boxes(boxes: torch.Tensor, width: int, pixels: int, canvas: torch.Tens
     """Lowers `canvas` [B, H * W + 1] at the first `pixels` pixels of the boxes [B, n, 16] of patches."""
     number = constant(torch.arange, boxes.device, float(pixels))
     lift, start, wide, area = boxes[..., 12:].unsqueeze(3).unbind(2)
-    row = (number / wide).floor()
+    row = torch.div(number, wide, rounding_mode="floor")
     column = torch.addcmul(number, row, wide, value=-1)
     anchored, products = boxes[..., :3, None], boxes[..., 3:12].unflatten(2, (3, 3))[..., None]
     along = torch.addcmul(anchored, products[:, :, :, 1], column[:, :, None])
     ratios = torch.addcmul(along, products[:, :, :, 2], row[:, :, None])
-    sizes = ratios.abs()
     far = lift / ratios[:, :, 0]
-    hit = (sizes[:, :, 1:].amax(2) <= sizes[:, :, 0]) & (far > NEAR_M) & (number < area)
+    inside = torch.linalg.vector_norm(ratios[:, :, 1:], torch.inf, dim=2) <= ratios[:, :, 0]
+    hit = inside & (far > NEAR_M) & (number < area)
     pixel = where(hit, torch.add(column, row, alpha=width) + start, canvas.shape[1] - 1.0).long()
     canvas.scatter_reduce_(1, pixel.flatten(1), far.flatten(1), "amin")
 
@@ -149,7 +170,10 @@ def _ray_of_pixel(camera: Intrinsics, size: tuple[int, int]) -> tuple[tuple[floa
     )
 
 
-def _pixels_of_camera(camera: Intrinsics, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Focal lengths and principal point in pixels, counted from the middle of the first."""
+def _pixels_of_camera(camera: Intrinsics, size: tuple[int, int]) -> tuple[tuple, tuple[float, ...], tuple[float, ...]]:
+    """A matrix [3, 5] and numbers [4] that project a vector: after the matrix, numbers + (last four) / first = u, v, -u - 1, -v - 1
+    for the pixel u, v, counted from the middle of the first one. And the least that these four are in a picture."""
     (fx, fy, cx, cy), (height, width) = camera, size
-    return (fx * width, fy * height), (cx * width - 0.5, cy * height - 0.5)
+    (u, v), (x, y) = (fx * width, fy * height), (cx * width - 0.5, cy * height - 0.5)
+    taken = (1.0, 0.0, 0.0, 0.0, 0.0), (0.0, -u, 0.0, u, 0.0), (0.0, 0.0, -v, 0.0, v)
+    return taken, (x, y, -x - 1, -y - 1), (0.0, 0.0, -float(width), -float(height))

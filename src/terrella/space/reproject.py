@@ -4,22 +4,39 @@ Keyframes that see another surface at a pixel are masked there."""
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import kernels_do, where
-from .camera import FAR_M, SAME, Intrinsics, project, rotation, unproject
+from ..core.backend import constant, kernels_do, where
+from .camera import (
+    FAR_M,
+    NEAR_M,
+    SAME,
+    Intrinsics,
+    grid_intrinsics,
+    pixel_intrinsics,
+    pixels_at,
+    project,
+    rotation,
+    unproject,
+)
 from .kernels_numba.carried import carry, fetch, splat
 from .kernels_numba.planes import fill
 from .views import arrays, each_view
 
 
-def splat_depth(points: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
-    """World points [B, N, 3] -> nearest depth for each pixel of the view from `pose` [B, 7]: [B, H, W], FAR_M in holes."""
+def splat_depth(
+    points: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+    size: tuple[int, int],
+    turn: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """World points [B, N, 3] -> nearest depth for each pixel of the view from `pose` [B, 7], whose rotations are `turn`
+    [B, 3, 3]: [B, H, W], FAR_M in holes."""
     height, width = size
-    where, depth = project(points, pose, camera)
-    column, row = (where[..., 0] * width).floor().long(), (where[..., 1] * height).floor().long()
-    seen = (depth > 0.05) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    pixel = torch.where(seen, row * width + column, height * width)  # the last cell collects what is out of view
+    at, depth = project(points, pose, pixel_intrinsics(camera, size), turn)
+    pixel, inside = pixels_at(at, size)
+    pixel = where(inside & (depth > 0.05), pixel, height * width)  # the last cell collects what is out of view
     canvas = depth.new_full((len(points), height * width + 1), FAR_M)
-    canvas.scatter_reduce_(1, pixel, torch.where(seen, depth, FAR_M), "amin")
+    canvas.scatter_reduce_(1, pixel, depth, "amin")
     return canvas[:, :-1].view(-1, height, width)
 
 
@@ -28,6 +45,11 @@ def least_around(plane: torch.Tensor) -> torch.Tensor:
     padded = F.pad(plane, (1, 1, 1, 1), value=torch.inf)
     lines = torch.minimum(torch.minimum(padded[:, :-2], padded[:, 2:]), padded[:, 1:-1])
     return torch.minimum(torch.minimum(lines[..., :-2], lines[..., 2:]), lines[..., 1:-1])
+
+
+def least_around_slowly(plane: torch.Tensor) -> torch.Tensor:
+    """The same as `least_around` in fewer operators, for GPUs and gradients."""
+    return -F.max_pool2d(-plane, 3, 1, 1)
 
 
 def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
@@ -41,20 +63,23 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
 def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     """The same as `fill_holes`, in plain tensor algebra, also for GPUs and gradients."""
-    near = least_around(depth)
-    count = F.avg_pool2d((depth < near * 1.15)[:, None].float(), 3, 1, 1)[:, 0]
-    depth = torch.where((depth > near * 1.3) & (count > 0.55), near, depth)
-    inverse, weight = 1 / depth[:, None], (depth[:, None] < FAR_M).float()
-    stack, both = [], torch.cat([inverse * weight, weight], 1)
+    near = least_around_slowly(depth)
+    ratio = depth / near
+    count = F.avg_pool2d((ratio < 1.15)[:, None].float(), 3, 1, 1)[:, 0]
+    depth = torch.where((ratio > 1.3) & (count > 0.55), near, depth)[:, None]
+    inverse = depth.reciprocal()
+    stack = [torch.cat([inverse, torch.ones_like(inverse)], 1) * (depth < FAR_M)]
     for _ in range(levels):
-        stack.append(both)
-        both = F.avg_pool2d(both, 2, ceil_mode=True)
-    filled = both[:, :1] / both[:, 1:].clamp_min(1e-6)
-    for both in reversed(stack):
-        coarse = F.interpolate(filled, size=both.shape[-2:], mode="bilinear", align_corners=False)
-        weight = both[:, 1:]
-        filled = torch.where(weight > 1e-6, both[:, :1] / weight.clamp_min(1e-6), coarse)
-    return 1 / filled[:, 0].clamp_min(1 / FAR_M)
+        stack.append(F.avg_pool2d(stack[-1], 2, ceil_mode=True))
+    sums, weights = torch.cat([both.flatten(2) for both in stack], 2).split(1, 1)  # of all levels at once
+    means, known = sums / weights.clamp_min(1e-6), weights > 1e-6
+    sizes = [both.shape[-2:] for both in stack]
+    means, known = (part.split([height * width for height, width in sizes], 2) for part in (means, known))
+    filled = means[-1].unflatten(2, sizes[-1])
+    for mean, valid, size in zip(means[-2::-1], known[-2::-1], sizes[-2::-1]):
+        coarse = F.interpolate(filled, size=size, mode="bilinear", align_corners=False)
+        filled = torch.where(valid.unflatten(2, size), mean.unflatten(2, size), coarse)
+    return filled[:, 0].clamp_min(1 / FAR_M).reciprocal()
 
 
 def warp(
@@ -64,31 +89,38 @@ def warp(
     target_depth: torch.Tensor,
     target_pose: torch.Tensor,
     camera: Intrinsics,
+    turn: torch.Tensor | None = None,
+    target_turn: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Colour of K keyframes for every pixel of a target view.
 
     rgb [B, K, 3 (or any planes), H, W] in [0, 1]; depth [B, K, h, w]; pose [B, K, 7]; target_depth [B, H', W']; target_pose [B,
-    7]. Returns colour [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw the same surface, 0 where not) and
-    closeness [B, K, H', W']: the distance in the target over that in the keyframe."""
+    7]; turn [B, K, 3, 3] and target_turn [B, 3, 3]: the rotations of the poses, where they are at hand. Returns colour
+    [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw the same surface, 0 where not) and closeness [B, K, H',
+    W']: the distance in the target over that in the keyframe."""
     batch, keys = rgb.shape[:2]
     height, width = target_depth.shape[-2:]
-    points = unproject(target_depth, target_pose, camera).flatten(1, 2)
-    where, seen_depth = project(points[:, None].expand(-1, keys, -1, -1), pose, camera)
-    grid = (where * 2 - 1).view(batch * keys, height, width, 2)
-    seen_depth = seen_depth.view(batch, keys, height, width)
+    points = unproject(target_depth, target_pose, camera, target_turn).flatten(1, 2)
+    grid, ahead = project(points[:, None].expand(-1, keys, -1, -1), pose, grid_intrinsics(camera), turn)
+    grid, ahead = grid.view(batch * keys, height, width, 2), ahead.view(batch, keys, height, width)
     colour = F.grid_sample(rgb.flatten(0, 1), grid, mode="bilinear", padding_mode="border", align_corners=False)
     held = F.grid_sample(depth.flatten(0, 1)[:, None], grid, mode="nearest", padding_mode="border", align_corners=False)
-    held = held.view(batch, keys, height, width)
-    inside = (grid.abs().amax(-1) <= 1).view(batch, keys, height, width) & (seen_depth > 0.05)
-    agreement = _agreement(held, seen_depth, inside)
-    closeness = target_depth[:, None] / seen_depth.clamp_min(0.05)
-    return colour.view(batch, keys, -1, height, width), agreement, closeness
+    inside = _inside(grid, ahead.flatten(0, 1)).view_as(ahead)
+    agreement, near = _agreement(held.view_as(ahead), ahead, inside)
+    return colour.view(batch, keys, -1, height, width), agreement, target_depth[:, None] / near
 
 
-def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> torch.Tensor:
-    """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture."""
-    error = (held - ahead).abs() / ahead.clamp_min(0.05)
-    return where(inside, (1.5 - error / SAME).clamp(0, 1), 0.0)
+def _inside(grid: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
+    """bool [N, H, W]: which places in pictures, `grid` [N, H, W, 2] in [-1, 1], are seen, `ahead` [N, H, W] metres ahead."""
+    return (torch.linalg.vector_norm(grid, torch.inf, dim=-1) <= 1) & (ahead > NEAR_M)
+
+
+def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture. And `ahead`, at least NEAR_M."""
+    near = ahead.clamp_min(NEAR_M)
+    error = (held - ahead).abs() / near
+    most = constant(torch.tensor, held.device, 1.5)
+    return torch.sub(most, error, alpha=1 / SAME).clamp(0, 1) * inside, near
 
 
 def carry_unknown(
@@ -133,31 +165,33 @@ def carry_things(
 def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) -> torch.Tensor:
     """The same as `carry_things`, in plain tensor algebra, also for GPUs and gradients."""
     height, width = depth.shape[-2:]
-    flat = _flattened(depth, things)
-    points = unproject(flat, pose, camera).flatten(1, 2)
-    seen = _closed(splat_depth(points, target_pose, camera, (height, width)))
-    where, ahead = project(unproject(seen, target_pose, camera).flatten(1, 2), pose, camera)
-    grid, ahead = (where * 2 - 1).view(-1, height, width, 2), ahead.view(-1, height, width)
-    planes = torch.cat([rgb.float() / 255, torch.stack([things, flat, covered.float()], 1)], 1)
+    size, flat = depth.shape[-2:], _flattened(depth, things)
+    turn, target_turn = rotation(pose), rotation(target_pose)
+    points = unproject(flat, pose, camera, turn).flatten(1, 2)
+    seen = _closed(splat_depth(points, target_pose, camera, size, target_turn))
+    points = unproject(seen, target_pose, camera, target_turn).flatten(1, 2)
+    grid, ahead = project(points, pose, grid_intrinsics(camera), turn)
+    grid, ahead = grid.view(-1, *size, 2), ahead.view(-1, *size)
+    planes = torch.cat([rgb / 255, *(part[:, None] for part in (things, flat, covered))], 1)
     carried = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
-    inside = (grid.abs().amax(-1) <= 1) & (ahead > 0.05) & (carried[:, 5] < 0.5)
-    trust = _agreement(carried[:, 4], ahead, inside)[:, None]
+    trust = _agreement(carried[:, 4], ahead, _inside(grid, ahead) & (carried[:, 5] < 0.5))[0][:, None]
     carried = carried * (trust > 0)
     return torch.cat([carried[:, :3], trust, seen[:, None], carried[:, 3:4]], 1)
 
 
 def _closed(depth: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] with FAR_M in holes -> the same without."""
-    for way in (least_around, fill_holes):  # the first closes gaps in surfaces that come nearer
+    around = least_around if kernels_do(depth) else least_around_slowly
+    for way in (around, fill_holes):  # the first closes gaps in surfaces that come nearer
         depth = torch.where(depth < FAR_M, depth, way(depth))
     return depth
 
 
 def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """Depth [B, H, W] with that of things averaged over 9 x 9 pixels, so that a figure stays in one piece."""
-    thing = (things > 0.5).float()
-    summed = F.avg_pool2d(torch.stack([depth * thing, thing], 1), 9, 1, 4)
-    return torch.where(thing > 0, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
+    thing = things > 0.5
+    summed = F.avg_pool2d(torch.stack([depth, torch.ones_like(depth)], 1) * thing[:, None], 9, 1, 4)
+    return torch.where(thing, summed[:, 0] / summed[:, 1].clamp_min(1e-6), depth)
 
 
 def _kernels_do(rgb: torch.Tensor, *others: torch.Tensor) -> bool:

@@ -8,7 +8,7 @@ from typing import final
 import torch
 from torch import nn
 
-from ..core.backend import constant
+from ..core.backend import constant, table, where
 from ..core.spec import POSE, POSE_UNIT
 from ..core.state import State
 from ..space.camera import planar_pose, yaw
@@ -46,9 +46,10 @@ class Motion(nn.Module):
 
     def ends(self, place: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         """Logit that the episode ends at `place` [B, 2]: [B]."""
-        where = 2 * (place - self.middle) / self.span
-        logit = self.ending(torch.cat([where, action], -1))[:, 0]
-        return torch.where(where.abs().amax(1) < 1.2, logit, -20.0)  # what lies further away was never seen to end
+        at = 2 * (place - self.middle) / self.span
+        logit = self.ending(torch.cat([at, action], -1))[:, 0]
+        known = torch.linalg.vector_norm(at, torch.inf, dim=1) < 1.2
+        return where(known, logit, -20.0)  # what lies further away was never seen to end
 
 
 @final
@@ -89,7 +90,7 @@ class MotionBody:
         return {
             "pose": planar_pose(place[:, 0], place[:, 1], height, heading),
             "speed": speed,
-            "dreamt": torch.ones_like(state["dreamt"]),
+            "dreamt": constant(torch.tensor, pose.device, True).expand(len(pose)),
         }
 
     def ends(self, after: State, action: torch.Tensor) -> torch.Tensor:
@@ -117,17 +118,19 @@ class NoBody(Absent):
 def follow_stairs(levels: torch.Tensor, before: torch.Tensor, after: torch.Tensor, z: torch.Tensor) -> torch.Tensor:
     """The viewer's height [B] after a step from place `before` to `after` [B, 2], coming from `z` [B]: it rises as the recorded
     places around, `levels` [K, 3], do, as far as a step up or down leads there, and leans towards them as it walks."""
-    reached = []
-    for place in (before, after):
-        near = torch.cdist(place, levels[:, :2])
-        weight = 1 / (near**2 + 0.01) ** 2 * ((near < 2.5) & ((levels[:, 2] - z[:, None]).abs() < 1.5))
-        total = weight.sum(1)
-        reached.append(torch.where(total > 0, (weight * levels[:, 2]).sum(1) / total.clamp_min(1e-9), z))
-    lean = (0.5 * (after - before).norm(dim=-1)).clamp(max=1.0)
-    return z + (reached[1] - reached[0] + lean * (reached[1] - z)).clamp(-0.3, 0.3)
+    near = torch.cdist(torch.stack([before, after]), levels[:, :2])  # [2, B, K]
+    level = (levels[:, 2] - z[:, None]).abs() < 1.5
+    weight = (near.square() + 0.01).square().reciprocal() * ((near < 2.5) & level)
+    total, high = weight.sum(2), (weight * levels[:, 2]).sum(2)
+    reached = torch.where(total > 0, high / total.clamp_min(1e-9), z)
+    lean = (0.5 * torch.linalg.vector_norm(after - before, dim=-1)).clamp(max=1.0)
+    return z + torch.addcmul(reached[1] - reached[0], lean, reached[1] - z).clamp(-0.3, 0.3)
 
 
 def rotate(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """[B, 2] rotated counter-clockwise by [B] radians."""
-    c, s = angle.cos(), angle.sin()
-    return torch.stack([vector[:, 0] * c - vector[:, 1] * s, vector[:, 0] * s + vector[:, 1] * c], -1)
+    aside = vector @ constant(table, vector.device, *_QUARTER)
+    return torch.addcmul(vector * angle.cos()[:, None], aside, angle.sin()[:, None])
+
+
+_QUARTER = (0.0, 1.0), (-1.0, 0.0)

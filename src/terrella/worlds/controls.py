@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium import spaces
 
 from ..core.backend import constant
@@ -68,10 +67,23 @@ class Controls:
         """Actions [B, ...] of `space` as float32 [B, numbers]: buttons as they are, choices one-hot, axes scaled to -1..1."""
         given = action.reshape(len(action), -1).float()
         if self.kind == CHOICE:
-            whole = given.round().long()
-            picked = [(whole[:, n] - int(low)).clamp(0, self.counts[n] - 1) for n, low in enumerate(self.low)]
-            return torch.cat([F.one_hot(one, count) for one, count in zip(picked, self.counts)], 1).float()
+            low, high = (constant(torch.tensor, action.device, limit) for limit in (self.low, self.high))
+            picked = torch.clamp(given.round(), low, high)
+            which, options = (
+                constant(make, action.device, self.low, tuple(self.counts)) for make in (_which, _options)
+            )
+            return (picked[:, which] == options).float()
         if self.kind == AXES:
             low, high = (constant(torch.tensor, action.device, limit) for limit in (self.low, self.high))
             return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)
         return given
+
+
+def _which(low: tuple[float, ...], counts: tuple[int, ...]) -> torch.Tensor:
+    """int64 [numbers]: the choice that each number of an encoded action is of."""
+    return torch.arange(len(low)).repeat_interleave(torch.tensor(counts))
+
+
+def _options(low: tuple[float, ...], counts: tuple[int, ...]) -> torch.Tensor:
+    """float32 [numbers]: the options of the choices, one after another."""
+    return torch.cat([first + torch.arange(count) for first, count in zip(low, counts)]).float()

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..core.backend import constant
-from ..space.mosaic import read_mosaic
+from ..space.mosaic import displaced, read_mosaic
 from ..space.overlap import Blend, MountedCamera
 from .generator import Conditioning, encode_depth, parts_of
 from .scroll import Scroll, predicted_scroll
@@ -170,7 +170,7 @@ class FlowNetwork(nn.Module):
             return torch.cat([self.draw(noise[part], conditioning.at(part), steps) for part in parts])
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:
-            memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]) * ~self.over
+            memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]).masked_fill(self.over, 0)
         rgb = torch.add(constant(torch.tensor, noise.device, -1.0), conditioning.glimpse.rgb, alpha=2)
         x = self.sample(rgb, conditioning.context, scroll, memory, noise[:, :3], steps)
         return torch.cat([x, constant(_no_depth, x.device, *self.config.size).expand(len(x), -1, -1, -1)], 1)
@@ -247,17 +247,13 @@ def carry(
     """Frames [B, 3, H, W] in -1..1 that went on by `moves` int64 [n, 2] of index `scroll` int64 [B]; what lies over them, bool
     [H, W], stays. What was outside of them, or under what lies over them, is as it is remembered (memory: as in `encode`), else as
     at the nearest edge."""
-    height, width = last.shape[-2:]
-    along = moves[torch.where(over, 0, scroll[:, None, None])]  # [B, H, W, 2]
-    x = constant(torch.arange, last.device, width) - along[..., 0]
-    y = constant(torch.arange, last.device, height)[:, None] - along[..., 1]
-    near_x, near_y = x.clamp(0, width - 1), y.clamp(0, height - 1)
-    place = near_y * width + near_x
+    place, rows, columns = displaced(moves[scroll], last.shape[-2:], last.shape[-2:])
     carried = last.flatten(2).gather(2, place.flatten(1)[:, None].expand(-1, 3, -1)).view_as(last)
+    carried = torch.where(over, last, carried)
     if memory is None:
         return carried
-    new = (x != near_x) | (y != near_y) | over.flatten()[place] & ~over
-    return torch.where(new[:, None] & (memory[:, 3:] > 0), memory[:, :3] / 127.5 - 1, carried)
+    new = ~(rows[..., None] & columns[:, None]) | over.flatten()[place]
+    return torch.where((new > over)[:, None] & (memory[:, 3:] > 0), memory[:, :3] / 127.5 - 1, carried)
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor, most: float) -> torch.Tensor:

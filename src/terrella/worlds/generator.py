@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..core.backend import kernels_do
+from ..core.backend import kernels_do, plus
 from ..space.keyframes import Glimpse, merge
 from .carried_frames import PLANES
 from .config import THUMBNAIL, GeneratorConfig
@@ -73,7 +73,11 @@ class Block(nn.Module):
         self.context = nn.Linear(context, channels)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-        inner = F.silu(self.first(x) + self.context(context)[:, :, None, None])
+        return self.shifted(x, self.context(context))
+
+    def shifted(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
+        """The same with `self.context` of the context [B, channels]."""
+        inner = F.silu(self.first(x) + context[:, :, None, None])
         return F.silu(x + self.second(inner))
 
 
@@ -122,45 +126,54 @@ class UNet(nn.Module):
         glimpse, last = conditioning.glimpse, conditioning.last
         if self.residual:
             noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
-        context = torch.cat([time[:, None], conditioning.context], 1)
-        colours, trust = glimpse.rgb * 2 - 1, glimpse.trust
-        merged = merge(glimpse) * 2 - 1
+        contexts = self._contexts(torch.cat([time[:, None], conditioning.context], 1))
+        colours, trust = plus(-1.0, glimpse.rgb, 2), glimpse.trust
+        merged = plus(-1.0, merge(glimpse), 2)
         depth = encode_depth(glimpse.depth)[:, None]
-        last_rgb, last_trust = last[:, :3] * 2 - 1, last[:, 3:4]
-        shown = (colours * (trust > 0)[:, :, None]).flatten(1, 2), trust, last_rgb * (last_trust > 0), last_trust
+        last_rgb, last_trust = plus(-1.0, last[:, :3], 2), last[:, 3:4]
+        lasting = last_trust > 0
+        shown = (colours * (trust > 0)[:, :, None]).flatten(1, 2), trust, last_rgb * lasting, last_trust
         parts = [merged, *shown, depth, glimpse.known[:, None], noisy[:, :4]]
         if self.moving:
             carried = encode_depth(last[:, 4:5])
-            parts += [carried * (last_trust > 0), last[:, 5:]]
+            parts += [carried * lasting, last[:, 5:]]
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
         x, kept = x.contiguous(memory_format=torch.channels_last), []  # like the weights
         for level, block in enumerate(self.before):
-            x = block(x, context)
+            x = block.shifted(x, contexts.pop(0))
             if level < len(self.down):
                 kept.append(x)
                 x = self.down[level](x)
-        x = self.after[-1](x, context)
+        contexts.reverse()
+        x = self.after[-1].shifted(x, contexts.pop(0))
         for level in reversed(range(len(self.down))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level](x, context)
+            x = self.after[level].shifted(x, contexts.pop(0))
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # by default a thing stays as it was; what was not seen is not copied
-            thing = LASTING * last[:, 5:6] - 1e4 * (last_trust <= 0).float()
+            thing = torch.add(LASTING * last[:, 5:6], ~lasting, alpha=-1e4)
             votes = torch.cat([votes[:, :-2], votes[:, -2:-1] + thing, votes[:, -1:]], 1)
         share = votes.softmax(1)
         own = out[:, self.choices + 1 : self.choices + 4]
         if self.residual:
             rgb = colours[:, 0] + own
         else:
-            rgb = share[:, :1] * merged + share[:, -2:-1] * last_rgb + share[:, -1:] * own
+            rgb = torch.addcmul(share[:, :1] * merged, share[:, -2:-1], last_rgb)
+            rgb = torch.addcmul(rgb, share[:, -1:], own)
             for slot in range(self.slots):
-                rgb = rgb + share[:, 1 + slot : 2 + slot] * colours[:, slot]
+                rgb = torch.addcmul(rgb, share[:, 1 + slot : 2 + slot], colours[:, slot])
         if self.moving:
             trusted = share[:, -2:-1]  # the last frame's depth has the same share as its colour
-            return torch.cat([rgb, depth + trusted * (carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
+            return torch.cat([rgb, torch.addcmul(depth, trusted, carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
         return torch.cat([rgb, depth + out[:, -1:]], 1)
+
+    def _contexts(self, context: torch.Tensor) -> list[torch.Tensor]:
+        """What the blocks `before`, then those `after`, make of the context [B, n]."""
+        layers = [block.context for block in (*self.before, *self.after)]
+        weight, bias = (torch.cat([getattr(layer, name) for layer in layers]) for name in ("weight", "bias"))
+        return list(F.linear(context, weight, bias).split([layer.out_features for layer in layers], 1))
 
 
 def channels_last(generator: Network) -> Network:
@@ -173,7 +186,7 @@ def channels_last(generator: Network) -> Network:
 
 def encode_depth(depth: torch.Tensor) -> torch.Tensor:
     """Metres to a logarithmic code of about [-1, 1]."""
-    return depth.clamp(NEAR_DEPTH_M, FAR_DEPTH_M).log() / 2 - 0.6
+    return plus(-0.6, depth.clamp(NEAR_DEPTH_M, FAR_DEPTH_M).log(), 0.5)
 
 
 def decode_depth(code: torch.Tensor) -> torch.Tensor:

@@ -27,7 +27,7 @@ from ..space.reproject import carry_unknown, fill_holes
 from .carried_frames import Frame, carry_frames, covered_pixels, static_depth
 from .config import KeyframesConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
-from .localisation import AWAY_M, localise
+from .localisation import localise
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
 
 SEEN: tuple[str, ...] = "rgb", "depth", "things", "pose", "instances"  # state entries of a frame
@@ -232,10 +232,11 @@ class KeyframeScene:
         two metres; and the share of its own memory that is in use."""
         pose, kept = state["pose"], self.recorded.pose
         angle = (self._table[:, 2] - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
-        apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY) + 2 * angle.abs()
-        nearest = F.pad(apart, (0, 1), value=AWAY_M).amin(1)
-        own = self.own.count(state).float() / max(1, self.own.capacity)
-        return torch.stack([nearest.clamp_max(20).log1p(), own], 1)
+        apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY)
+        apart = torch.add(apart, angle.abs(), alpha=2)
+        nearest = apart.amin(1).clamp_max(20) if len(kept) else pose.new_full((len(pose),), 20.0)
+        own = self.own.count(state) / max(1, self.own.capacity)
+        return torch.stack([nearest.log1p(), own], 1)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
         """With the frame; memory keeps it if it shows a new view of which little was known."""
@@ -269,7 +270,7 @@ class KeyframeScene:
 def _cell_codes(places: torch.Tensor) -> torch.Tensor:
     """Codes int64 [N] of the map's cells in which places [N, 2] lie."""
     column, row = (places / CELL_M).floor().clamp(-(2**30), 2**30).long().unbind(-1)
-    return column * 2**31 + row
+    return torch.add(row, column, alpha=2**31)
 
 
 def own_memory(config: KeyframesConfig, device: str) -> Memory:

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from ..core import chance
-from ..core.backend import constant
+from ..core.backend import constant, kernels_do
 from ..core.deferred import Deferred, Step
 from ..core.errors import ContractError
 from ..core.spec import Camera, Spec
@@ -232,7 +232,7 @@ class LearnedWorld:
         after = self._draw(after, state, seeds, still)
         after = after.replace(**self.outcome.step(state, after, ends, numbers, seeds))
         others = [name for name in after if name not in (*self._drawn_names, "reward")]
-        kept = {name: _where(still, state[name], after[name]) for name in others if after[name] is not state[name]}
+        kept = _where(still, state, after, [name for name in others if after[name] is not state[name]])
         nothing = constant(torch.tensor, self.device, 0.0)
         return after.replace(**kept, reward=torch.where(still, nothing, after["reward"]))
 
@@ -306,7 +306,7 @@ class LearnedWorld:
         clean = self._generated(conditioning, now["seeds"])
         expected = self.uncertainty.expected(conditioning, clean, after["gone"])
         drawn = self.take(after, before, conditioning, clean).replace(**expected._asdict())
-        return {name: _where(now["still"], before[name], drawn[name]) for name in self._drawn_names}
+        return _where(now["still"], before, drawn, self._drawn_names)
 
     def _generated(self, conditioning: Conditioning, seeds: torch.Tensor) -> torch.Tensor:
         noise = chance.normal(seeds, (4, *self.size), stream=NOISE)
@@ -328,6 +328,23 @@ def _finished(part: Any) -> Any:
     return part.eval().requires_grad_(False) if isinstance(part, nn.Module) else part
 
 
-def _where(which: torch.Tensor, one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Entries of `one` [B, ...] where `which` [B], of `other` elsewhere."""
-    return torch.where(which.view(-1, *[1] * (one.ndim - 1)), one, other)
+def _where(which: torch.Tensor, one: State, other: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
+    """The entries `names`: of `one` where `which` [B], of `other` elsewhere."""
+    if kernels_do(which) and not which.any():
+        return {name: other[name] for name in names}
+    values = {}
+    for kind in dict.fromkeys(other[name].dtype for name in names):  # those of a type at once
+        mine = [name for name in names if other[name].dtype == kind]
+        shapes = [other[name].shape for name in mine]
+        if len(mine) < 4:
+            flags = (which.view(-1, *[1] * (len(shape) - 1)) for shape in shapes)
+            values |= {name: torch.where(flag, one[name], other[name]) for name, flag in zip(mine, flags)}
+            continue
+        counts = [shape[1:].numel() for shape in shapes]
+        both = [
+            torch.cat([state[name].reshape(-1, count) for name, count in zip(mine, counts)], 1)
+            for state in (one, other)
+        ]
+        parts = torch.where(which[:, None], *both).split(counts, 1)
+        values |= {name: part.view(shape) for name, part, shape in zip(mine, parts, shapes)}
+    return values

@@ -14,12 +14,14 @@ from gymnasium import spaces
 from torch import nn
 
 from ..core import chance
+from ..core.backend import constant, table, where
 from ..core.errors import ObservationError
 from ..core.spec import EVENT
 from ..core.state import State
 from ..space.billboards import PICTURE, Cutout, cut_out, paint_billboards
 from ..space.camera import Intrinsics, yaw
 from ..space.floorplan import NOWHERE
+from .body import rotate
 from .generator import DrawnFrame
 from .parts import GOES, LOOKS, MOVES, Absent, Channels, Evidence, Tensors, Walls
 
@@ -27,6 +29,7 @@ from .parts import GOES, LOOKS, MOVES, Absent, Channels, Evidence, Tensors, Wall
 # move (x, y), steps since that move, and brightness relative to its look's own.
 NUMBER, PLACE, LOOK, AGE, BEFORE, GOING, RESTED, LIGHT = 0, slice(1, 4), 4, 5, 6, slice(7, 9), 9, 10
 COLUMNS = 11
+LOOKS_SEEN, COUNTED = slice(LOOK, BEFORE + 1, BEFORE - LOOK), slice(AGE, RESTED + 1, RESTED - AGE)
 NONE = -1
 ALIKE = 0.6  # distance of marks up to which two looks are the same
 STICKS = 0.2  # how much nearer another look must be for a thing to change to it
@@ -149,9 +152,9 @@ class Billboards(nn.Module):
     def paint(self, state: State, frame: DrawnFrame, camera: Intrinsics | None) -> DrawnFrame:
         """The frame with the state's billboards in it."""
         assert camera is not None and frame.depth is not None and frame.things is not None
-        rgb = frame.rgb.float() / 255
+        rgb = frame.rgb / 255
         rgb, depth, instances = self.painted(state["billboards"], rgb, frame.depth, state["pose"], camera)
-        things = torch.maximum(frame.things, (instances > 0).float())
+        things = torch.maximum(frame.things, instances > 0)
         return DrawnFrame((rgb * 255).round().to(torch.uint8), depth, things, instances)
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
@@ -193,19 +196,19 @@ class Billboards(nn.Module):
 
     def next_logits(self, billboards: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor) -> BillboardLogits:
         """Of billboards [n, COLUMNS], seen from `pose` [n, 7] after the actions [n, history, A], the newest last."""
-        apart, heading = billboards[:, PLACE] - pose[:, :3], yaw(pose)
-        c, s = heading.cos(), heading.sin()
-        ahead, aside = apart[:, 0] * c + apart[:, 1] * s, apart[:, 1] * c - apart[:, 0] * s
-        far = apart[:, :2].norm(dim=1).clamp_min(0.1)
-        where = [
-            ahead / 10, torch.tanh(aside / 0.4), torch.tanh(aside), torch.tanh(aside / 4), far.log() / 2,
-            (aside.abs() < ahead).float(), (ahead > 0).float(), (apart[:, 2] / 2).clamp(-2, 2),
-            apart[:, 0] / far, apart[:, 1] / far, *(8 * billboards[:, GOING]).unbind(1),
+        apart = billboards[:, PLACE] - pose[:, :3]
+        along = rotate(apart[:, :2], -yaw(pose))  # how far ahead, and how far aside
+        ahead, aside = along.split(1, 1)
+        far = torch.linalg.vector_norm(apart[:, :2], dim=1, keepdim=True).clamp_min(0.1)
+        before = ahead > 0
+        at = [
+            ahead / 10, torch.tanh(aside / constant(torch.tensor, aside.device, (0.4, 1.0, 4.0))), far.log() / 2,
+            aside.abs() < ahead, before, (apart[:, 2:] / 2).clamp(-2, 2), apart[:, :2] / far, 8 * billboards[:, GOING],
         ]  # fmt: skip
-        look, before = ((billboards[:, column].long() + 1) for column in (LOOK, BEFORE))  # NONE comes first
-        age, rested = (billboards[:, column].long().clamp(0, AGES) for column in (AGE, RESTED))
-        aimed = torch.exp(-((aside / WIDE_M) ** 2))[:, None] * (ahead > 0)[:, None]  # how straight it is aimed at
-        parts = [self.look(look), self.before(before), self.age(age), self.rested(rested), torch.stack(where, 1), aimed]
+        look, earlier = (billboards[:, LOOKS_SEEN].long() + 1).unbind(1)  # NONE comes first
+        age, rested = billboards[:, COUNTED].long().clamp(0, AGES).unbind(1)
+        aimed = torch.exp(-((aside / WIDE_M).square())) * before  # how straight it is aimed at
+        parts = [self.look(look), self.before(earlier), self.age(age), self.rested(rested), *at, aimed]
         known = self.think(torch.cat([*parts, acts.flatten(1), aimed * acts.flatten(1)], 1))
         next_look = self.next_look(known).masked_fill(~self.follows[look], -1e9)  # no figure becomes another
         return BillboardLogits(next_look, self.next_move(known), self.goes(known)[:, 0])
@@ -219,15 +222,15 @@ class Billboards(nn.Module):
         flat = billboards.flatten(0, 1)
         logits = self.next_logits(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
         likely = logits.look.softmax(1)
-        likely = torch.where(likely < likely.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0, likely)
+        likely = likely.masked_fill(likely < likely.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0)
+        points = chance.uniforms(seeds, dict.fromkeys((LOOKS, MOVES, GOES), (rows,)))
         drawn = [
-            chance.choice(seeds, part.unflatten(0, (-1, rows)), stream=stream).flatten()
+            chance.chosen(points[stream], part.unflatten(0, (-1, rows))).flatten()
             for part, stream in ((likely, LOOKS), (logits.move.softmax(1), MOVES))
         ]
-        gone = chance.uniform(seeds, (rows,), stream=GOES) < logits.gone.sigmoid().unflatten(0, (-1, rows))
+        gone = points[GOES] < logits.gone.sigmoid().unflatten(0, (-1, rows))
         after = update_billboards(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float())
-        after = after.unflatten(0, (-1, rows))
-        after = torch.where(gone[..., None], 0.0, after)
+        after = after.unflatten(0, (-1, rows)).masked_fill(gone[..., None], 0.0)
         return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
 
     def painted(
@@ -237,9 +240,11 @@ class Billboards(nn.Module):
         look = billboards[..., LOOK].long()
         visible = (billboards[..., NUMBER] > 0) & (look != NONE)
         look = look.clamp_min(0)
-        light = billboards[..., LIGHT, None].expand(-1, -1, 3)
-        lit = torch.cat([light, torch.ones_like(light[..., :1])], -1)[..., None, None]
-        pictures = (self.pictures[look].float() / 255 * lit).clamp_max(1)
+        cover, colour = (
+            constant(torch.tensor, rgb.device, part) for part in ((0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 0.0))
+        )
+        lit = torch.addcmul(cover, billboards[..., LIGHT, None], colour)[..., None, None]
+        pictures = (self.pictures[look] / 255 * lit).clamp_max(1)
         return paint_billboards(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), visible, pose, camera)
 
     def bodies(self, state: State, half_m: float) -> torch.Tensor:
@@ -252,11 +257,9 @@ class Billboards(nn.Module):
         level = apart[..., 2] < STOREY_M
         outside = apart[..., :2].amax(-1) >= reach - 0.02  # a body inside of one may leave it
         stops = known & level & (reach > half_m) & outside
-        (x, y), half = billboards[..., PLACE][..., :2].unbind(-1), reach - half_m
-        left, right, low, high = x - half, x + half, y - half, y + half
-        sides = ((left, low, right, low), (left, high, right, high), (left, low, left, high), (right, low, right, high))
-        walls = torch.stack([torch.stack(side, -1) for side in sides], 1)
-        return torch.where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
+        half, places = (reach - half_m)[..., None], billboards[..., PLACE][..., :2].repeat(1, 1, 2)
+        walls = torch.addcmul(places[:, None], half[:, None], constant(table, reach.device, *_SIDES)[:, None])
+        return where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
 
     def match_evidence(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
         """The billboards [B, K, COLUMNS] of evidence, in the rows of `listed` [B, K, 4] = number and place. Those `before`
@@ -317,7 +320,7 @@ class NoObjects(Absent):
 
 def in_sight(state: State) -> torch.Tensor:
     """bool [B, K]: whether the last frame shows each billboard."""
-    rows = torch.arange(1, state["billboards"].shape[1] + 1, device=state["instances"].device)
+    rows = constant(torch.arange, state["instances"].device, 1, state["billboards"].shape[1] + 1)
     return (state["instances"].flatten(1)[:, None] == rows[:, None]).any(-1)
 
 
@@ -341,15 +344,18 @@ def new_billboards(number: torch.Tensor | float, place: torch.Tensor, look: torc
 
 def update_billboards(billboards: torch.Tensor, place: torch.Tensor, look: torch.Tensor) -> torch.Tensor:
     """Billboards [..., COLUMNS] one step later at place [..., 3] with look [...], their ages and last moves updated."""
-    after = billboards.clone()
-    move = place - billboards[..., PLACE]
-    went, other = move[..., :2].norm(dim=-1) > 1e-3, look != billboards[..., LOOK]
-    after[..., PLACE], after[..., LOOK] = place, look
-    after[..., BEFORE] = torch.where(other, billboards[..., LOOK], billboards[..., BEFORE])
-    after[..., AGE] = torch.where(other, 0.0, (billboards[..., AGE] + 1).clamp_max(AGES))
-    after[..., GOING] = torch.where(went[..., None], move[..., :2], billboards[..., GOING])
-    after[..., RESTED] = torch.where(went, 0.0, (billboards[..., RESTED] + 1).clamp_max(AGES))
-    return after
+    was = billboards[..., LOOK]
+    move, other = place - billboards[..., PLACE], look != was
+    went = torch.linalg.vector_norm(move[..., :2], dim=-1) > 1e-3
+    counted = (billboards[..., COUNTED] + 1).clamp_max(AGES).masked_fill(torch.stack([other, went], -1), 0.0)
+    before = torch.where(other, was, billboards[..., BEFORE])
+    going = torch.where(went[..., None], move[..., :2], billboards[..., GOING])
+    parts = [look[..., None], counted[..., :1], before[..., None], going, counted[..., 1:], billboards[..., LIGHT:]]
+    return torch.cat([billboards[..., :1], place, *parts], -1)
+
+
+# how the corners of a side of a body lie around its middle: x, y, x, y
+_SIDES = (-1.0, -1.0, 1.0, -1.0), (-1.0, 1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0), (1.0, -1.0, 1.0, 1.0)
 
 
 def brightness(picture: torch.Tensor) -> torch.Tensor:

@@ -38,7 +38,7 @@ class Scroll(nn.Module):
 def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Tensor) -> torch.Tensor:
     """By which of the `moves` int64 [K, 2] most of the picture goes on: int64 [B]."""
     frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)  # the newest first
-    went = edge_shares(frames[:, 1:].flatten(0, 1), frames[:, :-1].flatten(0, 1), moves).unflatten(0, (len(frames), -1))
+    went = edge_shares(frames[:, 1:], frames[:, :-1], moves)
     logits = scroll(scroll.frame_features(frames[:, 0]), conditioning.context, went)
     return least_off(logits, moves)
 
@@ -46,5 +46,5 @@ def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Te
 def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The move int64 [B], of `moves` [K, 2] with logits [B, K], with the least expected error in pixels: where several are likely
     one in the middle, since a picture that is off stays off."""
-    off = (moves[:, None] - moves).abs().sum(2).float()
+    off = torch.cdist(*[moves.float()] * 2, p=1)
     return (logits.softmax(1) @ off).argmin(1)

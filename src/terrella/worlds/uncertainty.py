@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
+from ..core.backend import constant, plus
 from ..core.state import State
 from ..space.camera import yaw
 from ..space.keyframes import merge
@@ -113,12 +114,13 @@ class UncertaintyNetwork(nn.Module):
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
         """Linear between the knots; in proportion beyond them, up to the ceiling."""
         answers, errors = self.answers, self.errors
-        at = torch.searchsorted(answers, answer).clamp(1, KNOTS - 1)
-        low, high = answers[at - 1], answers[at]
-        share = ((answer - low) / (high - low).clamp_min(1e-6)).clamp(0, 1)
-        inside = torch.lerp(errors[at - 1], errors[at], share)
-        below, above = (answer[..., None] / answers[:: KNOTS - 1].clamp_min(1e-6)).unbind(-1)
-        return torch.minimum(inside * below.clamp_max(1) * above.clamp_min(1), self.ceiling)
+        within = answer.clamp(answers[0], answers[-1])
+        at = torch.searchsorted(answers, within).clamp_min(1)
+        knots = torch.stack([answers, errors], 1).unfold(0, 2, 1)[at - 1]  # [..., answers or errors, below or above]
+        low, high = knots.unbind(-1)
+        share = (within - low[..., 0]) / (high - low)[..., 0].clamp_min(1e-6)
+        inside = torch.lerp(low[..., 1], high[..., 1], share)
+        return torch.minimum(inside * (answer / within.clamp_min(1e-6)), self.ceiling)
 
 
 @final
@@ -151,15 +153,16 @@ def drift(before: State, after: State, led: bool) -> torch.Tensor:
     if led:
         way = torch.zeros_like(way)
     elif "pose" in after:
-        turn = torch.sub(*yaw(torch.stack([after["pose"], before["pose"]])).unbind(0))
-        metres = (after["pose"] - before["pose"])[:, :2].norm(dim=-1)
+        poses = torch.stack([after["pose"], before["pose"]])
+        turn = torch.sub(*yaw(poses).unbind(0))
+        metres = torch.linalg.vector_norm(poses[0, :, :2] - poses[1, :, :2], dim=-1)
         way = way + torch.stack([metres, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
     return torch.cat([steps, way, gone[:, 3:]], 1)
 
 
 def placed(gone: torch.Tensor) -> torch.Tensor:
     """`gone` [B, len(GONE)] of a frame whose pose is right: neither metres nor radians from evidence."""
-    return torch.cat([gone[:, :1], torch.zeros_like(gone[:, 1:3]), gone[:, 3:]], 1)
+    return gone * constant(torch.tensor, gone.device, (1.0, 0.0, 0.0, 1.0, 1.0))
 
 
 def situation_of(gone: torch.Tensor, conditioning: Conditioning) -> torch.Tensor:
@@ -171,7 +174,7 @@ def situation_of(gone: torch.Tensor, conditioning: Conditioning) -> torch.Tensor
 def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     """Maps [B, INPUT_MAPS, H / CELLS, W / CELLS] of a drawn frame and its sources."""
     glimpse, last = conditioning.glimpse, conditioning.last
-    drawn, merged = clean[:, :3].clamp(-1, 1), merge(glimpse) * 2 - 1
+    drawn, merged = clean[:, :3].clamp(-1, 1), plus(-1.0, merge(glimpse), 2)
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)
     second = glimpse.rgb[:, min(1, glimpse.rgb.shape[1] - 1)]
     apart = ((glimpse.rgb[:, 0] - second).abs().mean(1, keepdim=True)) * (trust[:, 1:] > 0)
