@@ -153,7 +153,8 @@ class UNet(nn.Module):
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # by default a thing stays as it was; what was not seen is not copied
-            thing = torch.add(LASTING * last[:, 5:6], ~lasting, alpha=-1e4)
+            thing = LASTING * last[:, 5:6]
+            thing = torch.where(lasting, thing, thing - 1e4)
             votes = torch.cat([votes[:, :-2], votes[:, -2:-1] + thing, votes[:, -1:]], 1)
         share = votes.softmax(1)
         own = out[:, self.choices + 1 : self.choices + 4]
