@@ -3,6 +3,8 @@
 Frames: world z up; camera x forward, y left, z up. A pose is float32 [..., 7]: x, y, z in metres, then the quaternion
 w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H)."""
 
+from collections.abc import Sequence
+
 import torch
 
 from ..core.backend import constant, table
@@ -81,7 +83,7 @@ def project(
     return torch.addcdiv(middle, local[..., 1:], depth.clamp_min(1e-4)[..., None]), depth
 
 
-def pixel_intrinsics(camera: Intrinsics, size: tuple[int, int]) -> Intrinsics:
+def pixel_intrinsics(camera: Intrinsics, size: Sequence[int]) -> Intrinsics:
     """Those by which `project` gives pixels, [0, W] x [0, H]."""
     (fx, fy, cx, cy), (height, width) = camera, size
     return fx * width, fy * height, cx * width, cy * height
@@ -93,7 +95,7 @@ def grid_intrinsics(camera: Intrinsics) -> Intrinsics:
     return 2 * fx, 2 * fy, 2 * cx - 1, 2 * cy - 1
 
 
-def pixels_at(places: torch.Tensor, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor]:
+def pixels_at(places: torch.Tensor, size: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
     """The pixel at each of `places` [..., 2], counted along rows, or the nearest: int64 [...]; and whether it lies in the picture,
     bool [...]."""
     inside = torch.fmax(places, constant(torch.tensor, places.device, 0.0))  # fmax and fmin pass over nan

@@ -1,6 +1,8 @@
 """The mosaic: the map and the memory of a flat world, its pictures stitched by how they scroll, with the current one in the middle.
 A pixel holds its most frequent colour (a majority vote, Boyer and Moore 1981), so that objects in front leave no trace."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 
@@ -59,7 +61,7 @@ def _window(mosaic: torch.Tensor, move: torch.Tensor, size) -> torch.Tensor:
 
 
 def displaced(
-    move: torch.Tensor, whole: tuple[int, int], size: tuple[int, int], corner: tuple[int, int] = (0, 0)
+    move: torch.Tensor, whole: Sequence[int], size: Sequence[int], corner: Sequence[int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where the pixels of windows of `size`, at `corner` (row and column) of `whole` pictures, come from if these went on by `move`
     int64 [n, 2] = x, y: the pixels int64 [n, H, W], counted along rows, or the nearest; and which rows [n, H] and which columns

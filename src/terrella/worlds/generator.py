@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar, final
+from typing import Any, TypeVar, final
 
 import torch
 import torch.nn.functional as F
@@ -140,16 +140,17 @@ class UNet(nn.Module):
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
         x, kept = x.contiguous(memory_format=torch.channels_last), []  # like the weights
-        for level, block in enumerate(self.before):
+        before, after = self._blocks
+        for level, block in enumerate(before):
             x = block.shifted(x, contexts.pop(0))
             if level < len(self.down):
                 kept.append(x)
                 x = self.down[level](x)
         contexts.reverse()
-        x = self.after[-1].shifted(x, contexts.pop(0))
+        x = after[-1].shifted(x, contexts.pop(0))
         for level in reversed(range(len(self.down))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = self.after[level].shifted(x, contexts.pop(0))
+            x = after[level].shifted(x, contexts.pop(0))
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # by default a thing stays as it was; what was not seen is not copied
@@ -170,9 +171,14 @@ class UNet(nn.Module):
             return torch.cat([rgb, torch.addcmul(depth, trusted, carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
         return torch.cat([rgb, depth + out[:, -1:]], 1)
 
+    @property
+    def _blocks(self) -> tuple[list[Any], list[Any]]:
+        """Those `before` and those `after`."""
+        return list(self.before), list(self.after)
+
     def _contexts(self, context: torch.Tensor) -> list[torch.Tensor]:
         """What the blocks `before`, then those `after`, make of the context [B, n]."""
-        layers = [block.context for block in (*self.before, *self.after)]
+        layers = [block.context for blocks in self._blocks for block in blocks]
         weight, bias = (torch.cat([getattr(layer, name) for layer in layers]) for name in ("weight", "bias"))
         return list(F.linear(context, weight, bias).split([layer.out_features for layer in layers], 1))
 
