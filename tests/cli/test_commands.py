@@ -35,7 +35,7 @@ OPTIONS = {
     "--pictures --policy --port --randomise --seed --size --task --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
-    "practise": "--adapter --device --episodes --fps --goal --group-size --groups --in --json --learning-rate --minutes "
+    "practise": "--adapter --episodes --fps --goal --group-size --groups --in --json --learning-rate --minutes "
     "--no-blind --noise --out --randomise --real --reference --reward --save-every-s --seed --size --steps --success --task "
     "--updates --within",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "

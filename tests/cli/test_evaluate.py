@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
 from tests.cli.tiny import NAME
 
 import terrella
 from terrella.act.paired_evaluation import PairedEvaluation
 from terrella.cli import main
-from terrella.workflows.evaluate import labels_of
+from terrella.workflows.evaluate import EvaluateConfig, labels_of, open_evaluation
+from terrella.workflows.progress import silent
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
 QUICK = ["--steps", "24", "--episodes", "6"]
@@ -105,3 +111,10 @@ def test_evaluating_from_python(tmp_path):
     assert result.scores.rows["constant:2"]["real"].value >= result.scores.rows["constant:0"]["real"].value
     assert result.names["constant:0"] == "constant:0" and result.summary().endswith(f"the page: {result.page}")
     json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_the_distance_to_a_goal_has_the_units_of_reality_inside_a_world_without_bounds():
+    study = open_evaluation(BLIND, EvaluateConfig(BLIND, goal="observation=16"), silent)
+    free = replace(study.spec, channels={"observation": spaces.Box(-np.inf, np.inf, (1,), np.float32)})
+    seen = {"observation": torch.tensor([[4.0]])}
+    assert float(study.pair.criterion.distance(SimpleNamespace(spec=free), seen)) == pytest.approx(12 / 24)

@@ -135,6 +135,18 @@ def test_practice_raises_the_share_of_successes(kind, tmp_path):
     assert share("run") > share("before") + 0.15
 
 
+def test_a_goal_that_leaves_numbers_open_is_the_same_goal_when_it_continues(tmp_path):
+    world, rule = (
+        Point(),
+        RewardRule(SuccessCriterion({"observation": torch.tensor([[0.0, torch.nan]])}, within=0.05), 2),
+    )
+    ImitationActor.write(imitator(world).network, tmp_path / "before", {})
+    for updates in (1, 2):
+        config = VerifiedPractice(updates=updates, groups=4, group_size=8, noise=0.5)
+        facts = practise_verified(world, tmp_path / "before", tmp_path / "run", config, rule, lambda *_: None)
+        assert facts["step"] == updates
+
+
 def test_what_is_never_reached_is_refused_before_training():
     world = Point()
     far = SuccessCriterion({"observation": torch.full((1, 2), 9.0)}, within=0.001)

@@ -216,7 +216,11 @@ def open_evaluation(
         dream = _simulator(name, config.environment)
     else:
         dream = load_named(name, device_of(config.device), progress=progress)
-    real = None if config.real is None else open_real(config.real, config.environment, dream.spec)
+    real = (
+        None
+        if config.real is None
+        else open_real(config.real, config.environment, dream.spec, "rgb" in dream.spec.channels)
+    )
     if real is not None:
         check_alike(dream.spec, real.spec)
     goal = read_goal(config.goal, dream.spec)

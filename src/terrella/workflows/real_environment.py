@@ -24,15 +24,18 @@ _NOT_COMPARED = {
 }  # fmt: skip
 
 
-def open_real(real: str, environment: EnvironmentConfig, spec: Spec) -> World:
-    """The real environment of a world with this spec, with pictures of the size that the world observes. What is randomised is
-    the simulator that stands for the world, never the real environment."""
+def open_real(real: str, environment: EnvironmentConfig, spec: Spec, pictures: bool = True) -> World:
+    """The real environment of a world with this spec, with pictures of the size that the world observes; without `pictures` a
+    Gymnasium environment renders none, and needs no display. What is randomised is the simulator that stands for the world, never
+    the real environment."""
     environment = replace(environment, randomise=None)
     shape = spec.channels["rgb"].shape if "rgb" in spec.channels else None
     if shape and "rgb" in spec.observes and environment.size is None and real.startswith("gym:"):
         environment = replace(environment, size=(shape[0], shape[1]))
     takes_snapshots = any(kind_of(channel) == "snapshot" for channel in spec.observes)
-    return FullyObserved(open_copied(real, environment)) if takes_snapshots else environment.open(real)
+    if takes_snapshots:
+        return FullyObserved(open_copied(real, environment))
+    return environment.open(real, rgb=pictures or not real.startswith("gym:") or real.startswith("gym:ALE/"))
 
 
 def refuse_randomised(world: str, environment: EnvironmentConfig) -> None:

@@ -18,7 +18,7 @@ from ..measure.trust import forecast_trust
 from .evaluate import EvaluateConfig, Evaluation, open_evaluation, play_policies, settings_of
 from .evaluation_log import EvaluationLog, fingerprint
 from .goals import read_goal
-from .opening import Device, EnvironmentConfig
+from .opening import EnvironmentConfig
 from .progress import Progress, silent, stage, stopping_with
 from .results import folder_name, jsonable, table_lines
 
@@ -49,7 +49,6 @@ class VerifiedPracticeConfig:
     """--no-blind: leave out the arm that practises without seeing the world."""
     practice: VerifiedPractice = VerifiedPractice()
     out: Path | None = None  # Folder of the run; default: practised/ and the policy's name.
-    device: Device = "cpu"
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def practise_by_rule(
     inside, folder = str(world), Path(config.out or f"practised/{folder_name(str(policy))}")
     _check(policy, config)
     evaluated = EvaluateConfig(
-        config.real, config.environment, config.episodes, config.steps, within=config.within, device=config.device,
+        config.real, config.environment, config.episodes, config.steps, within=config.within, device="cpu",
         seed=config.practice.seed,
     )  # fmt: skip
     study = open_evaluation(inside, evaluated, progress, lambda spec: _rule(config, spec))

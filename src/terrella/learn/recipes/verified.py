@@ -37,8 +37,8 @@ class VerifiedPractice:
     updates: int | None = None  # Training steps, each on one batch of groups.
     groups: int = 32  # Starts in a batch.
     group_size: int = 8  # Rollouts from each start, whose mean reward is the baseline.
-    noise: float = 0.1  # Standard deviation of the noise on continuous actions while it practises, in half ranges.
-    learning_rate: float = 3e-4  # Peak learning rate.
+    noise: float = 0.15  # Standard deviation of the noise on continuous actions while it practises, in half ranges.
+    learning_rate: float = 2e-3  # Peak learning rate.
     save_every_s: float = 30.0  # Seconds between saves.
     seed: int = 0  # Random seed.
 
@@ -91,7 +91,8 @@ def practise_verified(
     torch.manual_seed(config.seed)
     network = actor.network.requires_grad_(True)
     facts = {"policy": str(policy), "steps of a rollout": steps, "reference": str(rule.reference or ""), "blind": blind}
-    facts |= {"goal": {name: value.tolist() for name, value in criterion.goal.items()}, "within": criterion.within}
+    goal = {name: str(value.tolist()) for name, value in criterion.goal.items()}  # as text, for NaN is not NaN
+    facts |= {"goal": goal, "within": criterion.within}
     run = Run.of(out, config, report, device_of(world), ("minutes", "updates"), success=criterion.channel, **facts)
     starts = WorldStarts(world) if rule.reference is None else _references(world, rule.reference, steps, report)
     feed = VerifiedRollouts(world, actor, starts, criterion, steps, (config.groups, config.group_size), blind)
