@@ -1,7 +1,6 @@
 """Frames of a place, rendered on the server for browsers that cannot."""
 
 import json
-import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 
@@ -9,6 +8,7 @@ import simplejpeg
 import torch
 
 from ..core.errors import ServeError
+from ..space.camera import tilted_pose
 from ..space.edits import Contents, Edit, apply_edits
 from ..space.raster import Gaussians, rasterise
 
@@ -44,8 +44,7 @@ class FrameRenderer:
             raise ServeError(
                 f"a view has numbers below {FARTHEST_M:g}, and {SMALLEST} to {LARGEST} pixels a side; reload the page."
             )
-        c, s, cp, sp = math.cos(heading / 2), math.sin(heading / 2), math.cos(pitch / 2), -math.sin(pitch / 2)
-        pose = torch.tensor([[x, y, z, c * cp, -s * sp, c * sp, s * cp]])
+        pose = tilted_pose(*torch.tensor([[x], [y], [z], [heading], [pitch]]))
         with self._alone, torch.no_grad():
             text = json.dumps(list(edits := self._edits()))
             if text != self._done:

@@ -9,7 +9,7 @@ import html
 import json
 import re
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ MOST_STARTS = 64
 WHOLE = 150_000  # a place of at most this many Gaussians is sent in one part
 FIRST = 50_000  # of a larger place this many, spread evenly, are sent first; the page shows them while the rest arrives
 LONGEST_EDITS = 1 << 22  # bytes
-LONGEST_WISH = 1 << 12  # bytes of a request to put things
+LONGEST_WISH = 1 << 14  # bytes of a request for things or for a file
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
 
@@ -66,14 +66,21 @@ class PlacePage:
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
         )
 
-    def html(self, edits: Sequence[Edit], save: str = "", watch: str = "", frames: str = "", put: str = "") -> bytes:
+    def html(
+        self,
+        edits: Sequence[Edit],
+        save: str = "",
+        watch: str = "",
+        frames: str = "",
+        more: Mapping[str, str] | None = None,
+    ) -> bytes:
         """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
         the address of newer states of a place that is being fitted, without editing; frames: the address that renders for browsers
-        that cannot; put: the address that builds things that words name."""
+        that cannot; more: other addresses of a server: `things`, which builds what words name, and `files`, which writes files."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
-            "put": put,
+            **(more or {}),
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
@@ -223,15 +230,16 @@ class EditablePlace:
     ]  # replaces them with lines of JSON, or raises a TerrellaError, whose sentence the page shows
     beside: PlaceScene | None = None  # a place to compare it with
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
-    put: Callable[[str, Spot], PutThings] | None = (
-        None  # builds what words name, to be put at a spot; may raise a TerrellaError
-    )
+    put: Callable[[str, Spot], PutThings] | None = None  # builds what words name; may raise a TerrellaError
+    export: Callable[[Mapping[str, Any]], bytes] | None = None  # writes a file; may raise a TerrellaError
 
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; /things, which builds furniture by words; and /frame, which draws for browsers that cannot."""
+    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; and /frame, which
+    draws for browsers that cannot."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
+    writing = threading.Lock()  # one file at a time, while edits go on
     frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
 
     def save(content: bytes) -> None:
@@ -246,26 +254,26 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
                 )
             place.save(posted_edits["lines"])
 
+    def write_file(content: bytes) -> bytes:
+        wish = json.loads(content)
+        assert place.export is not None
+        with writing:
+            return place.export({**wish})
+
     def build_things(content: bytes) -> bytes:
         wish = json.loads(content)
         assert place.put is not None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
 
-    async def answer(request: Request, most: int, work: Callable[[bytes], bytes | None], form: str) -> Response:
-        try:
-            content = await run_in_threadpool(work, await posted(request, most))
-        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-            return PlainTextResponse(f"{form}; reload the page.", 422)
-        except TerrellaError as error:
-            return PlainTextResponse(str(error), 422)
-        return Response(content or b"", media_type="application/json" if content else "text/plain")
-
     async def keep(request: Request) -> Response:
-        return await answer(request, LONGEST_EDITS, save, "edits are lines of JSON")
+        return await _answer(request, LONGEST_EDITS, save, "edits are lines of JSON")
 
     async def put(request: Request) -> Response:
-        return await answer(request, LONGEST_WISH, build_things, "a thing has words and a spot")
+        return await _answer(request, LONGEST_WISH, build_things, "a thing has words and a spot")
+
+    async def write(request: Request) -> Response:
+        return await _answer(request, LONGEST_WISH, write_file, "a file has a kind")
 
     async def draw(request: Request) -> Response:
         try:
@@ -275,8 +283,21 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
 
     routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
     routes += [Route("/things", put, methods=["POST"])] if place.put else []
-    html = lambda: page.html(place.edits(), "/edits", frames="/frame", put="/things" if place.put else "")  # noqa: E731
+    routes += [Route("/files", write, methods=["POST"])] if place.export else []
+    more = {name: f"/{name}" for name, does in (("things", place.put), ("files", place.export)) if does}
+    html = lambda: page.html(place.edits(), "/edits", frames="/frame", more=more)  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
+
+
+async def _answer(request: Request, most: int, work: Callable[[bytes], bytes | None], form: str) -> Response:
+    """What `work` makes of the body of a POST of `most` bytes at most; a sentence where it cannot. form: what a body is."""
+    try:
+        content = await run_in_threadpool(work, await posted(request, most))
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return PlainTextResponse(f"{form}; reload the page.", 422)
+    except TerrellaError as error:
+        return PlainTextResponse(str(error), 422)
+    return Response(content or b"", media_type="application/json" if content else "text/plain")
 
 
 def serve_place(

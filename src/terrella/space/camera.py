@@ -126,6 +126,14 @@ def yaw(pose: torch.Tensor) -> torch.Tensor:
     )
 
 
+def tilted_pose(
+    x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor, pitch: torch.Tensor
+) -> torch.Tensor:
+    """A pose at (x, y, z) metres that looks along `heading` and `pitch` (upwards) radians: [...] each -> [..., 7]."""
+    c, s, cp, sp = torch.cos(heading / 2), torch.sin(heading / 2), torch.cos(pitch / 2), -torch.sin(pitch / 2)
+    return torch.stack([x, y, z, c * cp, -s * sp, c * sp, s * cp], -1)
+
+
 def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor) -> torch.Tensor:
     """A level pose at (x, y, z) metres that looks along `heading` radians: [...] each -> [..., 7]."""
     half = heading / 2

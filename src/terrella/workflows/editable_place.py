@@ -7,6 +7,7 @@ from ..library import folder_of
 from ..serve.place_page import EditablePlace
 from ..space.edits import Edit
 from ..worlds.splat_folder import checked_edits, merge_edit, read_edits, write_edits
+from .export_space import exported_file
 from .put_things import put_things
 from .splat_places import compared_scene, unedited_scene
 
@@ -24,6 +25,7 @@ def editable_place(world: str, beside: str | None = None) -> EditablePlace:
         None if beside is None else compared_scene(beside),
         None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
         lambda words, spot: put_things(folder, words, spot),
+        lambda wish: exported_file(world, wish),
     )
 
 

@@ -5,6 +5,7 @@ import { axes, matrices } from './camera.js';
 import { Compare } from './compare.js';
 import { Drawing, NEAR } from './draw.js';
 import { Editor } from './editor.js';
+import { Film } from './film.js';
 import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
@@ -77,8 +78,24 @@ function run({ drawing, source, story, solid: first }) {
   const compare = new Compare(redraw);
   const editor = new Editor(story, drawing, {
     changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look,
-    solid: () => solid, body: world.body, put: world.put, command: world.command,
+    solid: () => solid, body: world.body, put: world.things, command: world.command,
   });
+
+  const film = new Film($('film'), {
+    eye: () => walker.eye, stand: ([x, y, z, heading, pitch]) => { if (orbit.on) turnAround(); walker.set([x, y, z], heading, pitch, true); redraw(); },
+    picture, unsaved: () => story.unsaved, expose: (stops) => { drawing.stops = stops; redraw(); }, redraw: () => redraw(), say: toast,
+    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', address: world.files, command: world.command,
+  });
+
+  /** The view as a picture: a blob of PNG. */
+  function picture() {
+    paint();
+    const { width, height } = canvas, page = Object.assign(document.createElement('canvas'), { width, height }), context = page.getContext('2d');
+    context.fillStyle = '#0b0c0f';
+    context.fillRect(0, 0, width, height);
+    context.drawImage(canvas, 0, 0);
+    return new Promise((done) => { page.toBlob(done, 'image/png'); });
+  }
 
   /** A scene is drawn, and what is solid is read off it. */
   function take(scene) {
@@ -197,7 +214,7 @@ function run({ drawing, source, story, solid: first }) {
     seen.dirty = false;
     drawing.clear();
     const eye = shownEye(), view = { ...matrices(eye, lens()), eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
-    drawing.paint(view, part, editor.wires);
+    drawing.paint(view, part, [...editor.wires, ...film.wires]);
     compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
     editor.gizmo.place();
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
@@ -220,10 +237,12 @@ function run({ drawing, source, story, solid: first }) {
   const tint = () => { drawing.tint = 1 - drawing.tint; $('legend').hidden = !drawing.tint; flip('tint', !!drawing.tint); };
   const showMap = () => { $('minimap').hidden = !$('minimap').hidden; flip('map-open', !$('minimap').hidden); };
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
-  const putHere = () => { if (world.put && !drawing.remote) { if (!editor.open) editor.toggle(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
-  const does = { home, fly, orbit: turnAround, edit: () => editor.toggle(), tint, compared: contrast, 'map-open': showMap, full };
+  const filming = () => { if (editor.open && !film.open) editor.toggle(); film.toggle(); flip('filming', film.open); };
+  const editing = () => { if (film.open) filming(); editor.toggle(); };
+  const putHere = () => { if (world.things && !drawing.remote) { if (!editor.open) editing(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
+  const does = { home, fly, orbit: turnAround, edit: editing, filming, tint, compared: contrast, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editor.toggle(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editing(), KeyK: () => film.add(), KeyX: () => $('filming').hidden || filming(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
@@ -266,18 +285,18 @@ function run({ drawing, source, story, solid: first }) {
     }).catch((error) => toast(error.message));
   }
   if (drawing.remote) {
-    for (const id of ['edit', 'tint', 'compared', 'orbit']) $(id).hidden = true;
+    for (const id of ['edit', 'tint', 'compared', 'orbit', 'filming']) $(id).hidden = true;
     toast(world.watch ? 'This browser has no WebGL2; watch the fit in another one.' : 'This browser has no WebGL2, so the server draws. You can walk; editing needs WebGL2.');
   }
   if (world.watch) {
     $('making').hidden = false;
-    $('edit').hidden = $('compared').hidden = true;
+    $('edit').hidden = $('compared').hidden = $('filming').hidden = true;
     follow(world.watch, { newer, over: () => { $('making').hidden = true; toast(`The fit is done, or was stopped.${world.command ? ` If stopped, \`${world.command}\` continues it.` : ''}`); } });
   }
 
   // the state of the page, for scripts
   window.terrella = {
-    story, editor, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
+    story, editor, film, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
     get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {

@@ -52,7 +52,7 @@ export class Compare {
     if (!this.open) return;
     const canvas = $('other'), [, , width, height] = part;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    this.drawing.tint = ours.tint;
+    Object.assign(this.drawing, { tint: ours.tint, stops: ours.stops });
     this.drawing.clear();
     this.drawing.paint(view, part);
     this.db = rests ? decibels(read(ours, part), read(this.drawing, part)) : null;

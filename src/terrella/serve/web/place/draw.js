@@ -6,13 +6,14 @@ import { FULL_SHADER, LINE_SHADERS, SHOW_SHADER, SPLAT_SHADERS, STOP_SHADER } fr
 const ACROSS = 1024, TEXELS = 3;  // Gaussians in a row of the texture, and texels of each
 const BATCH = 256;  // of an instance: one instance for each Gaussian is slow to draw
 const PARTS = [0.01, 0.03, 0.06, 0.1, 0.16, 0.24, 0.35, 0.5, 0.7, 1];
+const GAMMA = 2.2;  // of the colours: a stop is a factor of 2 in linear light
 export const NEAR = 0.05;
 
 export class Drawing {
   constructor(canvas) {
     const gl = canvas.getContext('webgl2', { antialias: false, premultipliedAlpha: true });
     if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella space view`, which then draws on its own machine.');
-    Object.assign(this, { canvas, gl, ready: false, count: 0, coarse: 0, stands: 1, tint: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
+    Object.assign(this, { canvas, gl, ready: false, count: 0, coarse: 0, stands: 1, tint: 0, stops: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
     this.preview = this.still;
     this.splats = program(gl, SPLAT_SHADERS);
     this.lines = program(gl, LINE_SHADERS);
@@ -92,6 +93,7 @@ export class Drawing {
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(this.show.program);
     gl.uniform2f(this.show.at('corner'), x, y);
+    gl.uniform1f(this.show.at('gain'), 2 ** (this.stops / GAMMA));
     this.full(this.show);
     this.draw(wires, view, projection);
   }

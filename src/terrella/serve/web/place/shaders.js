@@ -94,5 +94,9 @@ export const SHOW_SHADER = `#version 300 es
 precision highp float;
 uniform sampler2D colour;
 uniform vec2 corner;
+uniform float gain;
 out vec4 pixel;
-void main() { pixel = texelFetch(colour, ivec2(gl_FragCoord.xy - corner), 0); }`;
+void main() {
+  pixel = texelFetch(colour, ivec2(gl_FragCoord.xy - corner), 0);
+  pixel.rgb *= gain;
+}`;
