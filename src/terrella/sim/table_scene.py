@@ -53,6 +53,12 @@ class TableArm:
     ]  # joint -> position at rest, rad or m: the hand points down, 0.2 m above the table, fingers along y
     grip: tuple[float, float]  # control of the gripper, its last actuator, when it is closed and open
     closed_m: float = 0.0  # gap between the fingers where both slides are at 0
+    firmer: float = (
+        1.0  # by how much the gripper's gains are multiplied and its pads stiffened, where the file's hold no block
+    )
+    adds_tip: tuple[str, tuple[float, float, float]] | None = (
+        None  # body and place of the tip's site, where the file has none
+    )
 
 
 def table_scene(arm: TableArm) -> Callable[[mujoco.MjSpec], None]:
@@ -105,20 +111,30 @@ def _prepare(spec: mujoco.MjSpec, arm: TableArm) -> None:
         spec.delete(one)
     spec.option.timestep, spec.option.cone, spec.option.impratio = 0.004, mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if arm.adds_tip is not None:
+        spec.body(arm.adds_tip[0]).add_site(name=arm.tip, pos=arm.adds_tip[1])
     base = spec.worldbody.first_body()
     base.pos = [arm.base[0], 0, arm.base[1]]
+    for site in spec.sites:
+        site.group = 4  # which is not drawn
     touching = {geom for name in arm.fingers for geom in _geoms_below(spec.body(name))}
     for body in spec.bodies:
         body.gravcomp = 1
         for geom in body.geoms:
             if body == spec.worldbody:
                 continue
-            solid = geom in touching and bool(geom.contype or geom.conaffinity)
+            # Pads that are boxes hold better than the hull of a finger's mesh.
+            solid = (
+                geom in touching and bool(geom.contype or geom.conaffinity) and geom.type != mujoco.mjtGeom.mjGEOM_MESH
+            )
             geom.contype, geom.conaffinity = (2, 1) if solid else (0, 0)
             if solid:
                 geom.friction, geom.condim, geom.priority = _GRIP, 4, 1
+                if arm.firmer > 1:
+                    geom.solref, geom.solimp = [0.008, 1], [0.99, 0.995, 0.001, 0.5, 2]
     grip = list(spec.actuators)[-1]
     grip.ctrllimited, grip.ctrlrange = True, list(arm.grip)
+    grip.gainprm, grip.biasprm = arm.firmer * grip.gainprm, arm.firmer * grip.biasprm
     spec.add_sensor(
         name="hand", type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=arm.tip
     )
