@@ -69,7 +69,7 @@ def test_parts_that_share_a_tensor_are_traced_apart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "compiler"), [("doom-maze", "eager"), ("doom-corridor", "inductor")])
+@pytest.mark.parametrize(("name", "compiler"), [("doom-maze", "eager"), ("doom-corridor", "eager")])
 def test_bundled_worlds_compile_whole(name, compiler):
     world = terrella.load(name)
     steps = StepPrograms(world, compiler)
