@@ -145,6 +145,33 @@ print(json.dumps(actions))
 """
 
 
+TRAIN = """
+from lerobot.configs.types import FeatureType
+from lerobot.datasets.utils import dataset_to_policy_features
+from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+where, = json.loads(sys.argv[2])
+data = LeRobotDataset("local/test", root=root, delta_timestamps={"action": [step / 10 for step in range(4)]})
+features = dataset_to_policy_features(data.meta.features)
+outputs = {name: one for name, one in features.items() if one.type is FeatureType.ACTION and name == "action"}
+inputs = {name: one for name, one in features.items() if one.type in (FeatureType.VISUAL, FeatureType.STATE)}
+config = make_policy_config(
+    "act", input_features=inputs, output_features=outputs, device="cpu", chunk_size=4, n_action_steps=4, dim_model=32,
+    n_heads=2, dim_feedforward=64, n_encoder_layers=1, n_vae_encoder_layers=1, pretrained_backbone_weights=None,
+)
+torch.manual_seed(0)
+policy = get_policy_class("act")(config)
+before, after = make_pre_post_processors(config, dataset_stats=data.meta.stats)
+optimizer = torch.optim.Adam(policy.parameters(), 1e-3)
+for batch, _ in zip(torch.utils.data.DataLoader(data, 8, shuffle=True), range(4)):
+    loss, _ = policy.forward(before(batch))
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+for part in (policy, before, after):
+    part.save_pretrained(where)
+print(json.dumps({"inputs": list(inputs), "loss": loss.item()}))
+"""
+
 OURS = """
 from pathlib import Path
 from lerobot.configs.policies import PreTrainedConfig
@@ -340,12 +367,22 @@ def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path):
             actions.append(action[0].numpy())
         assert np.abs(np.array(actions) - np.clip(theirs[kind], -1, 1)).max() < 1e-5
         assert np.ptp(actions, 0).min() > 1e-4 and np.abs(theirs[kind]).min() < 1, "or nothing was compared"
-    words = ["evaluate", str(policies / "act"), str(policies / "diffusion"), "idle", "--in", REACH, "--real", REACH]
+    words = ["evaluate", *(str(policies / kind) for kind in kinds), "idle", "--in", REACH, "--real", REACH]
     assert main([*words, "--episodes", "4", "--out", str(tmp_path), "--json"]) == 0
     evaluated = json.loads(capsys.readouterr().out)
-    assert "3 policies" in evaluated["verdict"][0]
+    assert "ranks these 4 policies as reality does" in evaluated["verdict"][0]
     for kind in ("act", "diffusion"):
         assert evaluated["rows"][kind]["real"] == evaluated["rows"][kind]["dream"] != evaluated["rows"]["idle"]["real"]
+
+
+def test_a_policy_that_lerobot_trained_on_our_recording_acts_here(tmp_path, capsys):
+    recording, trained = tmp_path / "recording", tmp_path / "trained"
+    assert main(["record", "world", REACH, "--frames", "60", "--out", str(recording)]) == 0
+    facts = json.loads(_lerobot(TRAIN, recording, (str(trained),)).splitlines()[-1])
+    assert {"observation.images.rgb", "observation.state"} <= set(facts["inputs"]) and np.isfinite(facts["loss"])
+    capsys.readouterr()
+    words = ["evaluate", str(trained), "--in", REACH, "--episodes", "2", "--out", str(tmp_path / "out")]
+    assert main(words) == 0 and "In the dream the best of 1 is trained" in capsys.readouterr().out
 
 
 def test_a_policy_of_lerobot_with_statistics_of_another_is_refused(policies):

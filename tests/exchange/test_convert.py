@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from terrella.care import doctor
 from terrella.core.errors import DatasetError
 from terrella.data import Dataset, Readings, Sensor, Source, Take
 from terrella.exchange import open_source, write_source
@@ -209,6 +213,45 @@ def test_language_that_changes_on_the_way_is_kept(tmp_path):
     write_source(Source("made", source.sensors, lambda: [told], 10.0), tmp_path / "set")
     (again,) = open_source(tmp_path / "set").takes()
     assert again.facts["language"] == said and Dataset(tmp_path / "set").episodes[0].tasks == ("open", "close")
+
+
+def annotated(root, persistent):
+    """Adds LeRobot's columns of annotations, as version 3.1 writes them."""
+    texts = [("role", pa.string()), ("content", pa.string()), ("style", pa.string()), ("camera", pa.string())]
+    tools = [("tool_calls", pa.list_(pa.string()))]
+    (file,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(file)
+    rows = pa.list_(pa.struct([*texts[:3], ("timestamp", pa.float32()), *texts[3:], *tools]))
+    events = [[{"role": "user", "content": "stop", "style": "interjection"}] * (at == 3) for at in range(len(table))]
+    table = table.append_column("language_persistent", pa.array([persistent] * len(table), rows))
+    table = table.append_column("language_events", pa.array(events, pa.list_(pa.struct([*texts, *tools]))))
+    pq.write_table(table, file)
+    info = json.loads((root / "meta/info.json").read_text())
+    language = {"dtype": "language", "shape": [1], "names": None}
+    info["features"] |= {"language_persistent": language, "language_events": language}
+    (root / "meta/info.json").write_text(json.dumps({**info, "codebase_version": "v3.1"}))
+
+
+def test_subtasks_of_lerobots_annotations_become_instructions(tmp_path):
+    source = some(10, (6,), SENSORS[2:5])
+    (take,) = source.takes()
+    write_source(Source("made", source.sensors, lambda: [replace(take, task="tidy up")], 10.0), tmp_path / "theirs")
+    said = [(0.25, "close", "subtask"), (0.0, "open", "subtask"), (0.0, "first open, then close", "plan")]
+    said = [{"role": "assistant", "content": text, "style": style, "timestamp": at} for at, text, style in said]
+    annotated(tmp_path / "theirs", said)
+    assert Dataset(tmp_path / "theirs").episodes[0].task == "tidy up" and doctor(tmp_path / "theirs") == []
+    opened = open_source(tmp_path / "theirs")
+    assert [note for note in opened.notes if "annotations" in note and "subtasks are kept" in note] == list(
+        opened.notes
+    )
+    (again,) = opened.takes()
+    assert again.facts["language"] == [[0.0, "open"], [0.25, "close"]] and again.task == "tidy up"
+    write_source(opened, tmp_path / "ours")
+    assert Dataset(tmp_path / "ours").episodes[0].tasks == ("open", "close")
+    write_source(Source("made", source.sensors, source.takes, 10.0), tmp_path / "broken")
+    annotated(tmp_path / "broken", [{**said[0], "timestamp": None}])
+    with pytest.raises(DatasetError, match="annotations in language_persistent are damaged"):
+        list(open_source(tmp_path / "broken").takes())
 
 
 def test_what_is_nothing_known_is_said(tmp_path):

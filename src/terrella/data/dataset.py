@@ -12,7 +12,7 @@ import numpy as np
 from ..core.errors import DatasetError
 from ..core.spec import Camera, kind_of
 from .channels import ACTION, DONE, REWARD, RGB, cameras_of, channel_of
-from .features import checked_features, decode_picture, sensors_of, to_metres, to_picture, unit_of
+from .features import PERSISTENT, checked_features, decode_picture, sensors_of, to_metres, to_picture, unit_of
 from .format import ACTION_VALID, DEPTH_BEYOND, INFO, TIME, names_of, stream_path, to_numpy
 from .meta import Episode, EpisodeTable, read_about, read_episodes, read_info, read_sensors, read_tasks
 from .source import Lazy, Readings, Sensor, Source, Take, is_action, is_outcome
@@ -182,7 +182,8 @@ class Dataset:
         streams = {name: self._stream(number, sensor) for name, sensor in self.streams.items()}
         readings |= {name: stream for name, stream in streams.items() if len(stream.time_s)}
         readings = {name: one for name, one in readings.items() if len(one.time_s)}
-        facts = {"language": self._language(episode, at)} if len(episode.tasks) > 1 else {}
+        language = self._language(episode, at) if len(episode.tasks) > 1 else self._subtasks(episode)
+        facts = {"language": language} if language else {}
         return Take(readings, episode.task, episode.start_ns, facts)
 
     def _of_rows(self, episode: Episode, name: str, at: np.ndarray) -> Readings:
@@ -217,6 +218,20 @@ class Dataset:
         changes = [0, *(np.flatnonzero(np.diff(number)) + 1)]
         texts = dict(enumerate(self.tasks))
         return [[float(at[row]), texts.get(int(number[row]), "")] for row in changes]
+
+    def _subtasks(self, episode: Episode) -> list[list]:
+        """The same of LeRobot's annotation of subtasks, which each row repeats; [] without."""
+        if PERSISTENT not in self.info["features"] or not episode.length:
+            return []
+        path, kind = self.files.local(episode.data), {PERSISTENT: {"dtype": "string", "shape": [1]}}
+        try:
+            notes = read_rows(path, [PERSISTENT], episode.start, episode.start + 1, kind)[PERSISTENT][0].as_py() or []
+            spoken = [[float(one["timestamp"]), str(one["content"])] for one in notes if one["style"] == "subtask"]
+        except (LookupError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"{self.root / episode.data}: the annotations in {PERSISTENT} are damaged ({error})."
+            ) from error
+        return sorted(spoken)
 
     def _pictures(self, episode: Episode, name: str) -> Sequence[np.ndarray]:
         """The rows of an image or depth sensor as stored, each decoded when it is read."""

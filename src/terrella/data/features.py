@@ -13,6 +13,8 @@ from .channels import MOST_AXES
 from .format import ACTION_VALID, AUTOMATIC, DEPTH_BEYOND, DEPTH_UNIT_M, TIME, names_of, schema
 from .source import Sensor
 
+LANGUAGE = "language"  # dtype of LeRobot's annotations (since v3.1): lists of {role, content, style, ...}
+PERSISTENT, EVENTS = "language_persistent", "language_events"
 _WIDEST = 1 << 27  # most numbers in a row of a feature; more is damage
 _PICTURES = ("PNG", "JPEG", "WEBP", "TIFF")
 _DEEP = ("I;16", "I;16B", "I;16L", "I", "F")  # Pillow's modes of one channel of more than 8 bits
@@ -22,9 +24,12 @@ _UNIT_KEYS = ("unit_m", "depth_unit_m", "depth_scale", "depth_unit", "unit", "un
 
 
 def checked_features(features: object) -> dict[str, dict]:
-    """The features of an info.json, checked; ValueError where they are invalid."""
+    """The features of an info.json but its annotations, checked; ValueError where they are invalid."""
     if not isinstance(features, dict) or not 0 < len(features) <= 10_000:
         raise ValueError("features")
+    features = {
+        name: one for name, one in features.items() if not (isinstance(one, dict) and one.get("dtype") == LANGUAGE)
+    }
     for name, feature in features.items():
         shape: list = (feature.get("shape") if isinstance(feature, dict) else None) or []
         whole = isinstance(shape, list) and 0 < len(shape) <= MOST_AXES and all(type(n) is int and n > 0 for n in shape)

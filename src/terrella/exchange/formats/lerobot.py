@@ -13,7 +13,7 @@ from ...core.errors import DatasetError
 from ...core.files import creating, not_written
 from ...data.channels import file_name
 from ...data.dataset import Dataset
-from ...data.features import unit_of
+from ...data.features import EVENTS, PERSISTENT, unit_of
 from ...data.format import ACTION_VALID, AUTOMATIC, TIME, Layout, whole_rate
 from ...data.recorder import NotFinite, Recorder
 from ...data.resample import SAME_TIME_S, Policy, resample, row_times
@@ -32,11 +32,15 @@ def read(root: str | Path, fps: float | None = None) -> Source:
             suppress(DatasetError, ValueError, OSError),
             open_parquet(data.files.local(data.episodes[0].data)) as table,
         ):
-            unlisted += [f"the column '{name}'" for name in table.schema_arrow.names if name not in data.features]
+            columns = [name for name in table.schema_arrow.names if name not in data.info["features"]]
+            unlisted += [f"the column '{name}'" for name in columns]
         films = data.files.list("videos", ".mp4")
         cameras = dict.fromkeys(film.split("/")[1] for film in films if film.count("/") > 1)
         unlisted += [f"the camera '{name}'" for name in cameras if name not in data.features]
-    notes = (f"{what} is not in info.json and was left out." for what in unlisted)
+    notes = [f"{what} is not in info.json and was left out." for what in unlisted]
+    if annotations := [name for name in (PERSISTENT, EVENTS) if name in data.info["features"]]:
+        where = " and ".join(annotations)
+        notes.append(f"of the annotations in {where} the subtasks are kept, as instructions in place of the task.")
     return replace(data.source(), notes=tuple(notes))
 
 
