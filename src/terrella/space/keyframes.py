@@ -154,9 +154,8 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
         return pick_slowly(votes, count)
     picks = pick_slowly(votes, count)  # never row 0 of own ones, which is all zeros
     order = constant(_lots, pose.device, len(shared), rows.shape[1])[picks].argsort(dim=1, stable=True)
-    known, none = (
-        constant(torch.tensor, pose.device, part).expand(batch, -1) for part in (tuple(range(len(shared))), (-1,))
-    )
+    known = constant(torch.arange, pose.device, len(shared)).expand(batch, -1)
+    none = constant(torch.tensor, pose.device, (-1,)).expand(batch, -1)
     numbers = torch.cat([known, len(shared) + rows, none], 1)
     picks = picks.gather(1, order)
     return numbers[constant(torch.arange, pose.device, batch)[:, None], picks]  # the pick -1 is the last number
