@@ -94,9 +94,8 @@ def test_what_a_person_does_comes_first_and_hits_and_death_are_shown(serve_world
     parts = page.locator("#hint span").all_text_contents()
     assert parts == ["Spaceattack", "WASDmove", "←→turn"]
     assert page.locator("#keys b").first.text_content() == "Space" and page.locator("figure .aim").count() == 1
-    page.keyboard.press("Space", delay=40)
-    until(page, "document.querySelector('.aim.struck') && Number(document.getElementById('vital-hit').textContent) > 0")
     page.keyboard.down("Space")
+    until(page, "document.querySelector('.aim.struck') && Number(document.getElementById('vital-hit').textContent) > 0")
     until(page, "document.getElementById('app').classList.contains('ended')")
     page.keyboard.up("Space")
     until(page, "document.getElementById('vital-health').textContent === '0'")  # of -20

@@ -141,7 +141,7 @@ def test_words_that_name_nothing_and_spots_that_are_none_are_refused(tmp_path, o
         ({"words": "a zeppelin", "spot": spot}, "is a thing to put"),
         ({"words": "a chair", "spot": {"at": [1]}}, "finite numbers"),
         ({"words": "a chair"}, "words and a spot"),
-        ({"words": "x" * 5000, "spot": spot}, "bytes"),
+        ({"words": "x" * 5000, "spot": spot}, "in 400 or fewer"),
     ):
         status, text = page.evaluate(post, json.dumps(body))
         assert status == 422 and sentence in text

@@ -45,7 +45,6 @@ export function middleOf(scene, mask) {
 
 /** The scene after an edit; an Error where nothing is selected. What was changed counts as not seen. others: a Map of what merges bring. */
 export function edited(scene, edit, others) {
-  if (edit.do === 'merge' && edit.place.startsWith('things/')) return `put ${edit.place.slice(7).replace(/-\w+$/, '')} at ${edit.by.join(' ')} m`;
   if (edit.do === 'merge') return merged(scene, others.get(edit.sha256), single(edit.by), single(edit.degrees)[0]);
   const mask = select(scene, edit.select), { by, degrees, factor, colour } = edit;
   if (!mask.count) throw new Error('nothing is selected there; choose another place.');
