@@ -224,6 +224,7 @@ def test_calibration_never_turns_the_order(tmp_path):
     answer = torch.linspace(0, 2, 500)
     meant = uncertainty.calibrated(answer)
     assert (meant.diff() >= 0).all() and 0 <= meant.min() and meant.max() <= 1
+    assert uncertainty.calibrated(torch.tensor([torch.nan])).isnan().all(), "no index beyond the knots"
 
 
 def test_neighbours_that_fall_are_pooled():

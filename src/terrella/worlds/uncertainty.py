@@ -115,7 +115,7 @@ class UncertaintyNetwork(nn.Module):
         """Linear between the knots; in proportion beyond them, up to the ceiling."""
         answers, errors = self.answers, self.errors
         within = answer.clamp(answers[0], answers[-1])
-        at = torch.searchsorted(answers, within).clamp_min(1)
+        at = torch.searchsorted(answers, within).clamp(1, KNOTS - 1)  # nan comes after all
         knots = torch.stack([answers, errors], 1).unfold(0, 2, 1)[at - 1]  # [..., answers or errors, below or above]
         low, high = knots.unbind(-1)
         share = (within - low[..., 0]) / (high - low)[..., 0].clamp_min(1e-6)
