@@ -28,11 +28,14 @@ def keyframes(count: int, rng: torch.Generator) -> Keyframes:
     return Keyframes.of(doubled(rgb.contiguous()), depth, pose, CAMERA)
 
 
-def place(controls: Controls, moving: bool = False, objects: bool = False, seed: int = 0) -> LearnedWorld:
+def place(
+    controls: Controls, moving: bool = False, objects: bool = False, seed: int = 0, history: int = 2
+) -> LearnedWorld:
     """A world with poses: keyframes of a room, a body that any kind of action moves, and, where asked for, things in it."""
     torch.manual_seed(seed)
     rng = make_rng(seed)
-    config = VideoConfig(CAMERA, controls.numbers, SIZE, (8, 8), history=2, body_m=0.3, memory_mb=1.0, moving=moving)
+    sees = {"history": history, "body_m": 0.3, "memory_mb": 1.0, "moving": moving}
+    config = VideoConfig(CAMERA, controls.numbers, SIZE, (8, 8), **sees)
     motion, generator = Motion(config.motion), UNet(config.generator)
     for weight in (generator.output.weight, *motion.glide.parameters()):
         torch.nn.init.normal_(weight, std=0.05)

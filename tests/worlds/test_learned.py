@@ -72,6 +72,13 @@ def test_a_frame_is_drawn_when_somebody_looks_and_looking_changes_nothing(monkey
         assert torch.equal(world.render(state, (name,))[name], world.render(looked, (name,))[name]), name
 
 
+def test_who_is_over_stands_still_where_no_earlier_action_is_seen():
+    world, rng = place(KINDS["buttons"], history=0), make_rng(1)
+    state = world.start(2, rng).replace(done=torch.tensor([True, False]))
+    after = world.imagine(state, torch.ones(2, 3, dtype=torch.int8), rng)
+    assert after["actions"].shape == (2, 0, 3) and torch.equal(after["pose"][0], state["pose"][0])
+
+
 def test_on_unknown_ground_the_walls_of_the_dream_count():
     """The rule of docs/decisions/0008: without recordings an episode has nothing but its own keyframes."""
     world = place(KINDS["buttons"])

@@ -342,7 +342,7 @@ def _where(which: torch.Tensor, one: State, other: State, names: Sequence[str]) 
             continue
         counts = [shape[1:].numel() for shape in shapes]
         both = [
-            torch.cat([state[name].reshape(-1, count) for name, count in zip(mine, counts)], 1)
+            torch.cat([state[name].reshape(len(which), count) for name, count in zip(mine, counts)], 1)
             for state in (one, other)
         ]
         parts = torch.where(which[:, None], *both).split(counts, 1)
