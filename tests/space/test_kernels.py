@@ -171,6 +171,8 @@ def test_straight_runs_are_those_of_the_slow_twin():
     runs = straight_runs(inverse, 0.5, 0.5)
     torch.testing.assert_close(runs, straight_runs_slowly(inverse, 0.5, 0.5))
     assert (runs[..., 1] > 0).sum() > 40
+    none = inverse[:0]
+    assert straight_runs_slowly(none, 0.5, 0.5).shape == straight_runs(none, 0.5, 0.5).shape == (0, 16, 4)
 
 
 def test_views_are_shared_out_whole_and_errors_come_back():

@@ -73,7 +73,7 @@ def straight_runs_slowly(inverse: torch.Tensor, focal: float, middle: float) -> 
     near = inverse.reciprocal().masked_fill(inverse < 1 / SEEN_M, torch.inf)
     joins = torch.linalg.vector_norm((near[:, None] * beside).diff(dim=2), dim=1) <= GAP_M
     # [K, first, last] of runs from column `first` to column `last`
-    lines = (inverse @ constant(_lines, *given)).view(count, -1, 2)
+    lines = (inverse @ constant(_lines, *given)).unflatten(1, (-1, 2))
     off = torch.baddbmm(inverse[:, None], lines, beside.expand(count, -1, -1), beta=-1).view(count, width, width, width)
     off = torch.linalg.vector_norm(off.masked_fill(constant(_outside, device, width), 0.0), torch.inf, dim=3)
     most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
