@@ -243,6 +243,29 @@ def test_a_copy_of_the_last_action_is_named(tmp_path):
         train_imitation(tmp_path / "recording", tmp_path / "other", QUICK, Imitation(outcome=True), quiet)
 
 
+class Slide(Sweep):
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+
+
+class Sawtooth:
+    """Falls from 1 to 0.2 in three steps, and jumps back."""
+
+    sees = ()
+
+    def begin(self, batch, rng):
+        return torch.zeros(batch)
+
+    def act(self, observation, memory, rng):
+        return 1 - 0.4 * memory[:, None] - 0.1 * torch.rand(len(memory), 1, generator=rng), (memory + 1) % 3
+
+
+def test_an_untrained_policy_of_axes_copies_nothing(tmp_path):
+    record(GymnasiumWorld(Slide), Sawtooth(), tmp_path / "recording", 300, make_rng(0))
+    few = replace(QUICK, steps=1)
+    facts = train_imitation(tmp_path / "recording", tmp_path / "run", few, Imitation(), quiet)
+    assert facts["held_out"] < facts["held_out_usual"] and "predicts no better than" in facts["held_out_verdict"]
+
+
 class Recall(gymnasium.Env):
     """Only the first observation shows which action, 0 or 2, the last step will reward."""
 

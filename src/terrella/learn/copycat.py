@@ -51,8 +51,7 @@ def copycat(network: ImitationNetwork, rows: DemonstrationRows, count: int) -> d
         "at_changes_copy_last": score(last[changes], truth[changes]),
     }  # fmt: skip
     figures = {name: round(value, 4) for name, value in figures.items()}
-    nearer = (mine - last).square().sum(1) < (mine - truth).square().sum(1)
-    copies = float(nearer[changes].float().mean()) if axes else _right(mine[changes], last[changes])
+    copies = score(mine[changes], last[changes])
     return {
         **figures,
         "copies_at_changes": round(copies, 4),
@@ -66,7 +65,7 @@ def _verdict(figures: dict[str, float], copies: float, config: ImitationConfig) 
     words = right.format(figures["held_out"]) + " the actions of held-out episodes"
     words += f" (copying the last: {figures['held_out_copy_last']:.0%})"
     words += f", and {figures['at_changes']:.0%} of those at which the teacher changes its action."
-    if copies > (0.5 if axes else max(0.5, figures["at_changes"])):
+    if copies > max(0.5, figures["at_changes"]):
         fewer = "Try --no-own-actions." if config.own_actions else "Try --history 1." if config.history > 1 else ""
         return f"The policy copies its last action where the teacher changes it: it {words} {fewer}".rstrip()
     if figures["held_out"] <= max(figures["held_out_copy_last"], figures["held_out_usual"]):
