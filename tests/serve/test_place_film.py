@@ -107,6 +107,16 @@ def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # no
     assert "the page writes spz" in page.evaluate(bad)
 
 
+def test_one_begins_as_the_picture_was_taken(tmp_path, opened, serving):  # noqa: F811
+    pose = torch.tensor([[2.0], [2.0], [1.6], [0.3], [-0.7]])
+    tilted = world(300)
+    tilted.starts = tilted_pose(*pose)
+    save_splat(tilted, tmp_path / "w")
+    page = opened(serving(build_place(editable_place(str(tmp_path / "w")))), size=(300, 200))
+    eye = page.evaluate("terrella.eye")
+    assert (eye["heading"], eye["pitch"]) == pytest.approx((0.3, -0.7), abs=1e-5)
+
+
 def test_exposure_is_a_factor_of_all_pictures(folder, opened, serving, tmp_path):  # noqa: F811
     assert main(["space", "export", str(folder), str(tmp_path / "place.html")]) == 0
     page = opened((tmp_path / "place.html").as_uri())

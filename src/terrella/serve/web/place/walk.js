@@ -11,7 +11,9 @@ export class Walker {
   start(number) {
     const { starts } = this.world, [x, y, z, qw, qx, qy, qz] = starts[number % starts.length];
     const heading = Math.atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz));
+    const pitch = Math.asin(Math.max(-1, Math.min(1, 2 * (qx * qz - qw * qy))));  // of a picture's camera
     this.set([x, y, z], heading, 0);
+    this.look(0, pitch);
   }
 
   set(place, heading, pitch, flying = false) {
