@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from terrella.core import make_rng
+from terrella.space import floorplan
 from terrella.space.billboards import PICTURE, paint_billboards
 from terrella.space.camera import FAR_M, planar_pose, rotation
 from terrella.space.floorplan import NOWHERE, columns_left, slide, slide_slowly, straight_runs, straight_runs_slowly
@@ -173,6 +174,10 @@ def test_straight_runs_are_those_of_the_slow_twin():
     assert (runs[..., 1] > 0).sum() > 40
     none = inverse[:0]
     assert straight_runs_slowly(none, 0.5, 0.5).shape == straight_runs(none, 0.5, 0.5).shape == (0, 16, 4)
+
+
+def test_what_is_kept_for_reading_walls_is_small():
+    assert floorplan._lines(320, 0.5, 0.5).nbytes < 4e6, "it grows with the square of the width"
 
 
 def test_views_are_shared_out_whole_and_errors_come_back():

@@ -73,7 +73,10 @@ def straight_runs_slowly(inverse: torch.Tensor, focal: float, middle: float) -> 
     near = inverse.reciprocal().masked_fill(inverse < 1 / SEEN_M, torch.inf)
     joins = torch.linalg.vector_norm((near[:, None] * beside).diff(dim=2), dim=1) <= GAP_M
     # [K, first, last] of runs from column `first` to column `last`
-    lines = (inverse @ constant(_lines, *given)).unflatten(1, (-1, 2))
+    values = inverse[:, None] * beside
+    sums = values.cumsum(2)
+    sums = sums[:, :, None] - (sums - values)[..., None]  # over runs: [K, 2, first, last]
+    lines = (constant(_lines, *given) * sums[:, None]).sum(2).flatten(2).mT
     off = torch.baddbmm(inverse[:, None], lines, beside.expand(count, -1, -1), beta=-1).view(count, width, width, width)
     off = torch.linalg.vector_norm(off.masked_fill(constant(_outside, device, width), 0.0), torch.inf, dim=3)
     most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
@@ -103,13 +106,13 @@ def _beside(width: int, focal: float, middle: float) -> torch.Tensor:
 
 
 def _lines(width: int, focal: float, middle: float) -> torch.Tensor:
-    """float64 [w, first * last * 2]: by which values of columns are multiplied for slope and level of the lines through them."""
-    left, inside = columns_left(width, focal, middle), (~_outside(width)).double()
-    count = inside.sum(2, keepdim=True).clamp_min(1)
-    apart = (left - (left * inside).sum(2, keepdim=True) / count) * inside
-    slope = apart / apart.square().sum(2, keepdim=True).clamp_min(1e-12)
-    level = inside / count - slope * (left * inside).sum(2, keepdim=True) / count
-    return torch.stack([slope, level], -1).permute(2, 0, 1, 3).reshape(width, -1)
+    """float64 [slope or level, 2, first, last]: by which the sums over a run of its values, times `_beside`, are multiplied for the
+    line of least squares."""
+    left, columns = columns_left(width, focal, middle), torch.arange(width, dtype=torch.float64)
+    count, mean = (columns - columns[:, None] + 1).clamp_min(1), (left + left[:, None]) / 2
+    sharp = torch.where(count > 1, 12 * (width * focal) ** 2 / (count**3 - count), 0.0)  # 1 / sum of (left - mean)^2
+    slope = torch.stack([sharp, -sharp * mean])
+    return torch.stack([slope, torch.stack([torch.zeros_like(mean), 1 / count]) - mean * slope])
 
 
 def _outside(width: int) -> torch.Tensor:
