@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import gc
 import json
+import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +21,7 @@ from safetensors.torch import save_file
 from tests.act.reach import NAME
 
 import terrella
-from terrella.act.lerobot_policy import PYTHON, LerobotConfig, LerobotPolicy, lerobot_folder
+from terrella.act.lerobot_policy import PYTHON, LerobotConfig, LerobotPolicy, _end, lerobot_folder
 from terrella.act.lerobot_program import HostedPolicy
 from terrella.act.planning import PlaySettings, play
 from terrella.cli import main
@@ -216,3 +219,10 @@ def test_a_python_without_lerobot_and_a_failing_one_are_sentences(folder, world,
     monkeypatch.delenv(PYTHON)
     with pytest.raises(CheckpointError, match=f"install lerobot 0.4.4 .* in {PYTHON}"):
         terrella.load_policy(saved(tmp_path / "c"), world.spec)
+
+
+def test_a_busy_process_ends_at_once():
+    began, pipe = time.monotonic(), subprocess.PIPE
+    busy = subprocess.Popen(["sleep", "60"], stdin=pipe, stdout=pipe)
+    _end(busy, tempfile.TemporaryFile())
+    assert busy.returncode is not None and time.monotonic() - began < 5

@@ -259,14 +259,11 @@ def _python(place: Path) -> str:
 
 
 def _end(process: subprocess.Popen, log: BinaryIO) -> None:
+    process.kill()  # it holds nothing to save, and may be busy for long
+    process.wait()
     for pipe in filter(None, (process.stdin, process.stdout, log)):
         with suppress(OSError):  # of what was not written
             pipe.close()
-    try:
-        process.wait(_PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _json(file: Path) -> Any:
