@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import pytest
 from PIL import Image
 
-from terrella.core.errors import TerrellaError
+from terrella.core.errors import ServeError, TerrellaError
 from terrella.exchange.browse import Browse
 from terrella.serve import ServeConfig
 from terrella.serve.http_server import make_server, open_port
@@ -27,6 +27,7 @@ from terrella.serve.viewer import build_viewer
 from terrella.workflows.opening import ControlsConfig
 from terrella.workflows.play import PlayConfig, first_seed
 from terrella.workflows.progress import silent
+from terrella.workflows.splat_places import unedited_scene
 from terrella.workflows.start import FolderShelf
 
 from . import rig
@@ -211,6 +212,23 @@ def test_a_picture_and_a_plan_become_places_in_folders_of_their_own(tmp_path, mo
     shelf.lift("..", b"")
     shelf.build_plan({"words": "rustic, at dusk"})
     assert lifted == [("My-Cat.png", "my-cat"), ("picture", "picture")] and planned == ["rustic-at-dusk"]
+
+
+def test_a_picture_that_cannot_be_lifted_is_named_as_it_was_dropped(tmp_path):
+    shelf = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent)
+    for name, sentence in (("a cat.png", "a-cat.png cannot be read"), ("film.mp4", "space fit film.mp4 makes")):
+        with pytest.raises(ServeError, match=sentence) as failed:
+            shelf.lift(name, b"pixels")
+        assert tempfile.gettempdir() not in str(failed.value) and not (tmp_path / "places").exists()
+
+
+def test_a_place_of_a_plain_picture_opens_with_a_warning(tmp_path):
+    shelf, file = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent), io.BytesIO()
+    Image.new("RGB", (96, 64), "grey").save(file, "PNG")
+    out = shelf.lift("grey.png", file.getvalue())
+    assert "the picture is plain" in unedited_scene(out).note
+    shelf.open(out)
+    assert shelf.progress() == "opening the place"
 
 
 def test_a_token_is_asked_for():

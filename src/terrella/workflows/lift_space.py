@@ -80,7 +80,8 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
     if config.fov is not None:
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
     layers = layers_of(rgb, lifter, focal, config.eye)
-    world = place_of(layers, picture.stem, {"picture": picture.name})
+    doubtful = doubts(layers)
+    world = place_of(layers, picture.stem, {"picture": picture.name} | ({"doubts": doubtful} if doubtful else {}))
     save_splat(world, out)
     facts = {
         "fov_deg": round(_fov(layers), 1), "pitch_deg": round(math.degrees(layers.pitch), 1),
@@ -88,7 +89,7 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
     }  # fmt: skip
     camera = f"lens {facts['fov_deg']:.0f} degrees wide, pitch {facts['pitch_deg']:.0f} degrees, "
     seen = _Seen(layers.depth, layers.error, layers.height_m, facts, camera)
-    return _result(seen, world, out, lifter.measured, [*notes, *doubts(layers)])
+    return _result(seen, world, out, lifter.measured, [*notes, *doubtful])
 
 
 def _lift_panorama(

@@ -53,7 +53,7 @@ def page_scene(
     collider = Solids(source.solids) if len(source.solids) or not walked else source.occupancy
     return PlaceScene(
         source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
-        config.keep, config.dt_s, source.object_names, other, "; ".join(unheeded(source.card)),
+        config.keep, config.dt_s, source.object_names, other, "; ".join(_notes(source.card)),
     )  # fmt: skip
 
 
@@ -63,6 +63,12 @@ def unheeded(card: Mapping[str, Any]) -> list[str]:
     return [
         f"{what}: {', '.join(map(str, words))}" for what, words in named.items() if isinstance(words, list) and words
     ]
+
+
+def _notes(card: Mapping[str, Any]) -> list[str]:
+    """What the page says of a place when it opens: words without effect, or why what was made of a picture may be poor."""
+    doubts = card.get("doubts")
+    return [*unheeded(card), *(str(one).rstrip(".") for one in (doubts if isinstance(doubts, list) else ()))]
 
 
 def unedited_scene(world: str) -> PlaceScene:

@@ -12,7 +12,7 @@ from PIL import Image
 
 from .. import library
 from ..care import repair
-from ..core.errors import ServeError
+from ..core.errors import ServeError, TerrellaError
 from ..core.world import make_rng
 from ..exchange.browse import browse
 from ..serve import ServeConfig
@@ -76,6 +76,7 @@ class FolderShelf:
 
     def open(self, name: str) -> Build:
         section = self._section(name)
+        self._note("opening the place" if section == "place" else "")
         if section == "place":
             place = editable_place(name)
             return lambda host, token: build_place(place, host, token)
@@ -99,7 +100,10 @@ class FolderShelf:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / (re.sub(r"[^\w.-]+", "-", Path(name).name).lstrip(".-") or "picture")
             file.write_bytes(picture)
-            return self._made(file.stem, lambda out: lift_space(file, out, LiftSpaceConfig(), progress=self._note))
+            try:
+                return self._made(file.stem, lambda out: lift_space(file, out, LiftSpaceConfig(), progress=self._note))
+            except TerrellaError as error:  # its folder is gone by the time that a person reads this
+                raise ServeError(str(error).replace(str(file), file.name)) from error
 
     def progress(self) -> str:
         return self._doing
@@ -113,10 +117,8 @@ class FolderShelf:
         stem = (stem if len(stem) <= LONGEST_NAME else stem[:LONGEST_NAME].rpartition("-")[0]) or "place"
         names = (f"{stem}-{number}" if number > 1 else stem for number in range(1, 1000))
         out = next(out for name in names if not (out := self._folder / "places" / name).exists())
-        try:
-            make(out)
-        finally:
-            self._note("")
+        self._note("")
+        make(out)
         return str(out)
 
     def _section(self, name: str) -> str:
