@@ -107,6 +107,24 @@ def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # no
     assert "the page writes spz" in page.evaluate(bad)
 
 
+def test_a_picture_of_the_view_is_without_the_path(folder, opened, serving):  # noqa: F811
+    page, pictures = opened(serving(build_place(editable_place(str(folder)))), size=(400, 300)), []
+    for place in ("[3, 1.6, 1.4]", "[3, 2.4, 1.4]", "[1, 2, 1.6]"):
+        page.evaluate(f"terrella.stand({place}, 0)")
+        if place != "[1, 2, 1.6]":
+            page.keyboard.press("KeyK")
+            assert "is kept" in page.inner_text("#toast")
+    page.keyboard.press("KeyX")
+    for views in (2, 0):
+        page.evaluate(f"terrella.film.views.length = {views}")
+        assert page.evaluate("terrella.film.wires.length") == views / 2
+        until(page, "terrella.idle")
+        with page.expect_download() as download:
+            page.click("[data-file=png]")
+        pictures.append(download.value.path().read_bytes())
+    assert len(set(pictures)) == 1
+
+
 def test_one_begins_as_the_picture_was_taken(tmp_path, opened, serving):  # noqa: F811
     pose = torch.tensor([[2.0], [2.0], [1.6], [0.3], [-0.7]])
     tilted = world(300)

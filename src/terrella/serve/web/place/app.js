@@ -87,13 +87,14 @@ function run({ drawing, source, story, solid: first }) {
     name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', address: world.files, command: world.command,
   });
 
-  /** The view as a picture: a blob of PNG. */
+  /** The view as a picture, without lines: a blob of PNG. */
   function picture() {
-    paint();
+    paint(false);
     const { width, height } = canvas, page = Object.assign(document.createElement('canvas'), { width, height }), context = page.getContext('2d');
     context.fillStyle = '#0b0c0f';
     context.fillRect(0, 0, width, height);
     context.drawImage(canvas, 0, 0);
+    redraw();
     return new Promise((done) => { page.toBlob(done, 'image/png'); });
   }
 
@@ -208,13 +209,13 @@ function run({ drawing, source, story, solid: first }) {
     return orbit.on ? orbit.eye(...shown) : { place, heading: shown[0], pitch: shown[1] };
   }
 
-  function paint() {
+  function paint(lines = true) {
     const sharp = (devicePixelRatio || 1) * Math.max(COARSEST, seen.share), width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     seen.dirty = false;
     drawing.clear();
     const eye = shownEye(), view = { ...matrices(eye, lens()), eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
-    drawing.paint(view, part, [...editor.wires, ...film.wires]);
+    drawing.paint(view, part, lines ? [...editor.wires, ...film.wires] : []);
     compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
     editor.gizmo.place();
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
@@ -242,7 +243,7 @@ function run({ drawing, source, story, solid: first }) {
   const putHere = () => { if (world.things && !drawing.remote) { if (!editor.open) editing(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
   const does = { home, fly, orbit: turnAround, edit: editing, filming, tint, compared: contrast, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
-  const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editing(), KeyK: () => film.add(), KeyX: () => $('filming').hidden || filming(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
+  const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editing(), KeyK: () => $('filming').hidden || film.add(), KeyX: () => $('filming').hidden || filming(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
     if (event.target.closest?.('input')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }

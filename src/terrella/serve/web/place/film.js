@@ -49,6 +49,7 @@ export class Film {
     if (this.views.length >= MOST) { this.on.say(`A path has ${MOST} views at most.`); return; }
     const { place, heading, pitch } = this.on.eye();
     this.views.push([...place, heading, pitch]);
+    if (!this.open) this.on.say(`View ${this.views.length} of the camera path is kept; X shows the path.`);
     this.show();
   }
 
