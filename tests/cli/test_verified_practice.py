@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 from tests.cli.tiny import NAME
 
 from terrella.cli import main
+from terrella.cli.train_policy import _evaluating
+from terrella.workflows.opening import EnvironmentConfig
+from terrella.workflows.verified_practice import VerifiedPracticeConfig
 
 BLIND = NAME.replace("Tiny-v0", "Blind-v0")
 SMALL = ["--updates", "2", "--groups", "4", "--group-size", "4", "--steps", "24", "--episodes", "6", "--within", "0.02"]
@@ -67,6 +71,17 @@ def test_without_an_environment_the_verdict_says_that_outside_is_not_measured(po
     result = practised(capsys, policy, tmp_path / "run", *GOAL, "--no-blind")
     assert result["verdict"][0].startswith("Not measured outside: name the environment with --real.")
     assert list(result["gains"]) == ["inside"] and result["failures"] is None
+    assert "--goal observation=16 --within 0.02 --steps 24 --best-of 4 16" in result["next"], "the same success"
+
+
+def test_the_command_that_follows_has_the_same_success_or_is_left_out():
+    def after(**settings):
+        return _evaluating(Path("p"), "world", VerifiedPracticeConfig(**settings))
+
+    assert after(success="won", within=0.1) == "terrella evaluate p --in world --success won --best-of 4 16"
+    small = after(goal=("x=1",), environment=EnvironmentConfig(size=(8, 8)))
+    assert small == "terrella evaluate p --in world --goal x=1 --size 8 8 --best-of 4 16"
+    assert after(goal=("x=1", "y=2")) == after(goal=("x=1",), success="won") == ""
 
 
 def test_the_best_of_several_plans_is_evaluated_beside_the_policy(policy, capsys, tmp_path):

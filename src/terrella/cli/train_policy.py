@@ -1,11 +1,12 @@
 """The commands `terrella train policy`, `train inverse` and `practise`."""
 
+from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from ..workflows.inverse import InverseConfig, train_inverse
-from ..workflows.results import command
+from ..workflows.results import changed_settings, command
 from ..workflows.train_policy import TrainPolicyConfig, train_policy
 from ..workflows.verified_practice import VerifiedPracticeConfig, practise_by_rule
 from .say import Json, RecordingName, say, show
@@ -55,7 +56,15 @@ def practise(
         world: The world to practise in: a name of `terrella list`, the path of a checkpoint or run, or a simulator (gym:ID).
     """
     practised = practise_by_rule(name, world, config, progress=say)
-    goal = config.goal[0] if len(config.goal) == 1 else None
-    within = None if config.within == VerifiedPracticeConfig.within else config.within
-    options = {"in": world, "real": config.real, "goal": goal, "within": within, "best_of": (4, 16)}
-    show(practised, json, command("terrella", "evaluate", practised.policy, **options))
+    show(practised, json, _evaluating(practised.policy, world, config))
+
+
+def _evaluating(policy: Path, world: str, config: VerifiedPracticeConfig) -> str:
+    """The command that evaluates a practised policy by the same success; "" where `evaluate` has no such, for a goal of several
+    parts."""
+    if len(config.goal) + bool(config.success) > 1:
+        return ""
+    within = config.within if config.goal and config.within != VerifiedPracticeConfig.within else None
+    options = {"in": world, "real": config.real, "goal": config.goal, "success": config.success, "within": within}
+    options |= {"steps": config.steps, **changed_settings(config.environment), "best_of": (4, 16)}
+    return command("terrella", "evaluate", policy, **options)
