@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, final
 
@@ -72,12 +72,9 @@ class Block(nn.Module):
         self.first, self.second = (nn.Conv2d(channels, channels, 3, padding=1) for _ in range(2))
         self.context = nn.Linear(context, channels)
 
-    def forward(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-        return self.shifted(x, self.context(context))
-
-    def shifted(self, x: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-        """The same with `self.context` of the context [B, channels]."""
-        inner = F.silu(self.first(x) + context[:, :, None, None])
+    def forward(self, x: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
+        """x [B, channels, H, W]; shift [B, channels] = `context` of the context, which `UNet` computes for all blocks at once."""
+        inner = F.silu(self.first(x) + shift[:, :, None, None])
         return F.silu(x + self.second(inner))
 
 
@@ -126,7 +123,7 @@ class UNet(nn.Module):
         glimpse, last = conditioning.glimpse, conditioning.last
         if self.residual:
             noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
-        contexts = self._contexts(torch.cat([time[:, None], conditioning.context], 1))
+        before, after = self._shifts(torch.cat([time[:, None], conditioning.context], 1))
         colours, trust = plus(-1.0, glimpse.rgb, 2), glimpse.trust
         merged = plus(-1.0, merge(glimpse), 2)
         depth = encode_depth(glimpse.depth)[:, None]
@@ -140,17 +137,15 @@ class UNet(nn.Module):
         fused = self.enter.weight.reshape(self.enter.out_channels, -1, 2, 2)  # pixel-unshuffle and `enter` in one
         x = F.silu(F.conv2d(torch.cat(parts, 1), fused, self.enter.bias, stride=2))
         x, kept = x.contiguous(memory_format=torch.channels_last), []  # like the weights
-        before, after = self._blocks
-        for level, block in enumerate(before):
-            x = block.shifted(x, contexts.pop(0))
+        for level, block in enumerate(self.before):
+            x = block(x, before[level])
             if level < len(self.down):
                 kept.append(x)
                 x = self.down[level](x)
-        contexts.reverse()
-        x = after[-1].shifted(x, contexts.pop(0))
+        x = self.after[-1](x, after[-1])
         for level in reversed(range(len(self.down))):
             x = kept[level] + F.interpolate(self.up[level](x), kept[level].shape[-2:], mode="nearest")
-            x = after[level].shifted(x, contexts.pop(0))
+            x = self.after[level](x, after[level])
         out = F.pixel_shuffle(self.output(x), 2)
         votes = out[:, : self.choices + 1]
         if self.moving:  # by default a thing stays as it was; what was not seen is not copied
@@ -171,16 +166,12 @@ class UNet(nn.Module):
             return torch.cat([rgb, torch.addcmul(depth, trusted, carried - depth) + out[:, -2:-1], out[:, -1:]], 1)
         return torch.cat([rgb, depth + out[:, -1:]], 1)
 
-    @property
-    def _blocks(self) -> tuple[list[Any], list[Any]]:
-        """Those `before` and those `after`."""
-        return list(self.before), list(self.after)
-
-    def _contexts(self, context: torch.Tensor) -> list[torch.Tensor]:
-        """What the blocks `before`, then those `after`, make of the context [B, n]."""
-        layers = [block.context for blocks in self._blocks for block in blocks]
+    def _shifts(self, context: torch.Tensor) -> tuple[Sequence[torch.Tensor], Sequence[torch.Tensor]]:
+        """What the blocks `before`, and those `after`, make of the context [B, n]."""
+        layers: list[Any] = [block.context for blocks in (self.before, self.after) for block in blocks]
         weight, bias = (torch.cat([getattr(layer, name) for layer in layers]) for name in ("weight", "bias"))
-        return list(F.linear(context, weight, bias).split([layer.out_features for layer in layers], 1))
+        shifts = F.linear(context, weight, bias).split([layer.out_features for layer in layers], 1)
+        return shifts[: len(self.before)], shifts[len(self.before) :]
 
 
 def channels_last(generator: Network) -> Network:
