@@ -154,6 +154,20 @@ def test_what_is_never_reached_is_refused_before_training():
         check_rewards(feed(world, imitator(world), far), far, lambda *_: None)
 
 
+def test_a_blind_arm_that_never_reaches_the_goal_stays_as_it_is(tmp_path):
+    world, far = Point(), SuccessCriterion({"observation": torch.full((1, 2), 9.0)}, within=0.001)
+    ImitationActor.write(imitator(world).network, tmp_path / "before", {})
+    config = VerifiedPractice(updates=2, groups=4, group_size=8)
+    blind = practise_verified(
+        world, tmp_path / "before", tmp_path / "run", config, RewardRule(far, 2), lambda *_: None, True
+    )
+    assert blind["step"] == 2
+    before, after = (
+        ImitationActor.load(tmp_path / name, world.spec).network.state_dict() for name in ("before", "run")
+    )
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
 def test_the_best_of_many_plans_succeeds_where_one_does_not():
     world = Point()
     usual, drawing = imitator(world, None), imitator(world, 1.0)
