@@ -97,6 +97,7 @@ def test_the_best_of_several_plans_is_evaluated_beside_the_policy(policy, capsys
         ([], "say what success is"),
         (["--goal", "position=3"], "position"),
         (["--goal", "observation=99"], "can never be reached"),
+        (["--goal", "observation=10", "--within", "0.9"], "already solved"),
         (["--goal", "3"], "give CHANNEL=VALUE"),
         (["--success", "won"], "won"),
         ([*GOAL, "--real", "gym:CartPole-v1"], "they differ"),
@@ -114,6 +115,7 @@ def test_what_cannot_be_practised_is_said_in_a_sentence(policy, capsys, tmp_path
     assert main(["practise", str(policy / "run"), "--in", BLIND, "--out", str(out), *SMALL, *words]) == 2
     error = capsys.readouterr().err
     assert sentence in error and "Traceback" not in error
+    assert not (out / "policy").exists(), "refused before it practises"
 
 
 def test_other_policies_are_refused(policy, capsys, tmp_path):

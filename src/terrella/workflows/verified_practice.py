@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import torch
 
+from ..act.paired_evaluation import CHUNK
 from ..act.planning import SuccessCriterion
 from ..act.planning.costs import checked_goal
 from ..core.errors import PlanningError, TerrellaError
@@ -140,7 +141,8 @@ def _rule(config: VerifiedPracticeConfig, spec: Spec) -> SuccessCriterion:
 
 
 def _check_study(study: Evaluation, config: VerifiedPracticeConfig, progress: Progress) -> None:
-    """PlanningError for a goal that the world cannot predict or that lies beyond its range; says where trust ends."""
+    """PlanningError for a goal that the world cannot predict, that lies beyond its range or where every start is; says where trust
+    ends."""
     pair, spec = study.pair, study.pair.dream.spec
     if pair.real is not None and pair.criterion.goal:
         checked_goal(pair.real.spec, {name: value[0] for name, value in pair.criterion.goal.items()})
@@ -156,6 +158,7 @@ def _check_study(study: Evaluation, config: VerifiedPracticeConfig, progress: Pr
                 f"{spec.name} does not predict '{name}' better than copying its last value, so success in it says nothing: train "
                 "it longer, record more, or name another channel."
             )
+    pair.starts(0, min(CHUNK, config.episodes))  # refuses a goal that every start has reached
     forecast = forecast_trust(pair.dream, pair.steps)
     if forecast is not None and forecast.ends:
         progress(
