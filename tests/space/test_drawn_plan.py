@@ -64,6 +64,28 @@ def test_things_stay_in_their_rooms_and_turn_their_backs_to_walls():
     assert len(blocks_of(plan).names) == 4 + 1 + len(plan.windows)  # all lie within their rooms
 
 
+def test_a_thing_belongs_to_the_room_that_it_is_drawn_in_and_keeps_its_back_to_the_wall_behind():
+    things = [
+        {"label": "picture", "at": [4.1, 3.0]},  # on the bedroom's side of the wall between
+        {"label": "bed", "at": [7.0, 3.9], "facing": "south"},  # nearer to the east, drawn with its head to the north
+    ]
+    picture, bed, *others = planned(things=things, furnish=True).layout.things
+    assert picture.facing == "east" and 4 < picture.at[0] < 4.2
+    assert bed.facing == "south" and bed.at[1] == pytest.approx(4.94 - 2.1 / 2)
+    assert others and all(one.at[0] < 4 for one in others)  # a picture in a kitchen furnishes no bedroom
+    (one, *counters) = planned(things=[{"label": "picture", "at": [3.9, 3.0]}], furnish=True).layout.things
+    assert one.facing == "west" and any(other.at[0] > 4 for other in counters)
+
+
+def test_a_door_between_rooms_comes_where_nothing_stands():
+    middle, things = 2.5, [{"label": "wardrobe", "at": [3.7, 3.3], "facing": "west"}]
+    plan = planned(things=things).layout
+    [door], [wardrobe] = plan.doors, plan.things
+    assert 1.06 + door.width / 2 < 0.06 + door.at < wardrobe.at[1] - wardrobe.size[0] / 2 - door.width / 2 < middle
+    (door,) = planned(things=[{"label": "rug", "at": [3.7, 2.6]}]).layout.doors
+    assert door.at + 0.06 == pytest.approx(middle)
+
+
 def test_empty_rooms_are_furnished_if_asked():
     things = [{"label": "bed", "at": [6, 4.2]}]
     plan = planned(things=things, furnish=True).layout
@@ -73,6 +95,14 @@ def test_empty_rooms_are_furnished_if_asked():
     (door,) = plan.doors
     middle = 0.06 + door.at
     assert not any(3.2 < one.at[0] < 4 and abs(one.at[1] - middle) < 0.4 for one in plan.things)
+    for y in (1.0, 2.0, 3.0):  # nor before a door that leads outside
+        plan = planned(things=[{"label": "door", "at": [0, y]}], furnish=True).layout
+        assert not any(
+            one.at[0] - one.size[one.facing in ("east", "west")] / 2 < 0.9
+            and abs(one.at[1] - y) < one.size[one.facing not in ("east", "west")] / 2 + 0.4
+            for one in plan.things
+            if one.at[2] < 1
+        )
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Any
 
 from ...core.errors import ContractError
 from .furniture import KINDS, SAME
-from .placing import furnish_drawn
+from .placing import CLEAR_M, furnish_drawn
 from .room_layout import MOST_THINGS, WALLS, read_layout
 from .text_layout import MOST_ROOMS, ROOMS, Decoration, ParsedText, decorate
 
@@ -14,6 +14,7 @@ INSET_M = 0.06  # from a drawn line to a room's own space: rooms that touch have
 TOUCH_M = 0.3  # rooms this near are side by side
 DOOR_M, WINDOW_M, LEAST_M = 0.95, 1.5, 1.5  # widths of openings, and the least side of a drawn room
 NEAR_M = 0.8  # an opening belongs to a wall this near; a thing this near to a wall turns its back to it
+BEHIND_M = 0.3  # what stands this near before a wall, as it is drawn, keeps its back to it
 DARK = ("cellar", "dungeon", "garage", "corridor", "courtyard", "garden")  # kinds of rooms without windows of their own
 BACK = {"east": "west", "west": "east", "north": "south", "south": "north"}
 
@@ -23,8 +24,8 @@ def layout_of_plan(plan: Mapping[str, Any]) -> ParsedText:
 
     plan: `rooms`, a list of {"kind": a kind of room, "box": [x0, y0, x1, y1]}, metres, x east, y north; `things`, a list of
         {"label": furniture, "door" or "window", "at": [x, y], "facing": a direction}; `words`, the style; `furnish`, whether
-        rooms without things get the usual furniture. Rooms that touch are joined by doors; outer walls get windows if none is
-        drawn.
+        rooms without things get the usual furniture. Rooms that touch are joined by doors, if possible where nothing stands;
+        outer walls get windows if none is drawn.
     """
     drawn, things = _listed(plan, "rooms", MOST_ROOMS), _listed(plan, "things", MOST_THINGS)
     if not drawn:
@@ -39,14 +40,14 @@ def layout_of_plan(plan: Mapping[str, Any]) -> ParsedText:
         label = SAME.get(str(one.get("label")), str(one.get("label")))
         if label in ("door", "window"):
             _opening(layout, label, _numbers(one.get("at"), 2, label))
-    entries = _doors(layout)
-    if not layout["windows"]:
-        _windows(layout, kinds)
     for one in things:
         if one.get("label") not in ("door", "window"):
             _thing(layout, one)
+    entries = _doors(layout)
+    if not layout["windows"]:
+        _windows(layout, kinds)
     for number, room in enumerate(layout["rooms"]):
-        if plan.get("furnish") is True and not any(_inside(room, one["at"]) for one in layout["things"]):
+        if plan.get("furnish") is True and not any(_room_of(layout, one["at"]) is room for one in layout["things"]):
             furnish_drawn(layout, number, decoration.furniture[number], entries[room["name"]])
     return ParsedText(read_layout(layout), layout, decoration.unknown, (), words)
 
@@ -98,8 +99,11 @@ def _ends(room: Mapping[str, Any], axis: int) -> tuple[float, float]:
     return room["at"][axis], room["at"][axis] + room["size"][axis]
 
 
-def _inside(room: Mapping[str, Any], at: Sequence[float]) -> bool:
-    return all(_ends(room, a)[0] - 0.2 <= at[a] <= _ends(room, a)[1] + 0.2 for a in range(2))
+def _room_of(layout: Mapping[str, Any], at: Sequence[float]) -> Mapping[str, Any] | None:
+    """The room in which a place lies, or the nearest one; None where it is far from all."""
+    off = [max(sign * (at[a] - _ends(room, a)[upper]) for a in range(2) for upper, sign in ((0, -1), (1, 1)))
+           for room in layout["rooms"]]  # fmt: skip
+    return layout["rooms"][off.index(min(off))] if min(off) <= 0.2 else None
 
 
 def _shared(room: Mapping[str, Any], wall: str, other: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -130,6 +134,8 @@ def _opening(layout: dict[str, Any], label: str, at: Sequence[float]) -> None:
 def _doors(layout: dict[str, Any]) -> dict[str, list[tuple[str, float]]]:
     """Joins rooms that touch, unless a door is drawn there. Returns where one comes into each room."""
     entries: dict[str, list[tuple[str, float]]] = {room["name"]: [] for room in layout["rooms"]}
+    for one in layout["doors"]:
+        entries[one["room"]].append((one["wall"], one["at"]))
     for room in layout["rooms"]:
         for wall in ("east", "north"):
             for other in layout["rooms"]:
@@ -141,13 +147,27 @@ def _doors(layout: dict[str, Any]) -> dict[str, list[tuple[str, float]]]:
                            if (one["room"], one["wall"]) == (side["name"], its)]  # fmt: skip
                 drawn = [at for at in middles if span[0] <= at <= span[1]]
                 if not drawn and span[1] - span[0] >= DOOR_M + 0.2:
-                    drawn = [sum(span) / 2]
+                    drawn = [_free(layout, room, axis, span)]
                     at = round(drawn[0] - _ends(room, 1 - axis)[0], 3)
                     layout["doors"].append({"room": room["name"], "wall": wall, "at": at, "width": DOOR_M})
                 for at in drawn:
                     entries[room["name"]].append((wall, at - _ends(room, 1 - axis)[0]))
                     entries[other["name"]].append((BACK[wall], at - _ends(other, 1 - axis)[0]))
     return entries
+
+
+def _free(layout: Mapping[str, Any], room: Mapping[str, Any], axis: int, span: tuple[float, float]) -> float:
+    """Where along the upper wall of a room a door comes: the middle of the span, or the nearest spot that is free."""
+    middle, slack, wall = sum(span) / 2, (span[1] - span[0] - DOOR_M - 0.2) / 2, _ends(room, axis)[1]
+
+    def bars(one: Mapping[str, Any], at: float) -> bool:
+        halves = [side / 2 for side in one["size"][:2]][:: -1 if one["facing"] in ("east", "west") else 1]
+        before = abs(one["at"][axis] - wall) < halves[axis] + CLEAR_M
+        return before and abs(one["at"][1 - axis] - at) < halves[1 - axis] + DOOR_M / 2 + 0.1
+
+    solid = [one for one in layout["things"] if one["at"][2] < 2 and not KINDS[one["label"]].soft]
+    ways = sorted((middle + slack * k / 10 for k in range(-10, 11)), key=lambda at: abs(at - middle))
+    return next((at for at in ways if not any(bars(one, at) for one in solid)), middle)
 
 
 def _windows(layout: dict[str, Any], kinds: Sequence[str]) -> None:
@@ -170,12 +190,14 @@ def _thing(layout: dict[str, Any], one: Mapping[str, Any]) -> None:
             f"'{label:.40}' is no kind of furniture; kinds are door, window, {', '.join(sorted(KINDS))}."
         )
     at, facing, kind = _numbers(one.get("at"), 2, label), str(one.get("facing", "south")), KINDS[label]
-    room = next((room for room in layout["rooms"] if _inside(room, at)), None)
+    room = _room_of(layout, at)
     if room is None or facing not in WALLS:
         raise ContractError(f"the {label} at {at} lies in no room; move it into one.")
     off = {wall: abs(at[axis] - _ends(room, axis)[upper]) for wall, (axis, upper) in WALLS.items()}
     nearest = min(off, key=lambda wall: off[wall])
     hangs = kind.stands == "hung"
+    if not hangs and off[BACK[facing]] < kind.size[1] / 2 + BEHIND_M:
+        nearest = BACK[facing]
     if hangs or (kind.stands == "wall" and off[nearest] < max(NEAR_M, kind.size[1])):
         facing, (axis, upper) = BACK[nearest], WALLS[nearest]
         at[axis] = _ends(room, axis)[upper]
