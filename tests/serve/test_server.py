@@ -321,6 +321,17 @@ def test_a_request_that_is_not_finished_in_time_is_closed(serve_world, monkeypat
         assert closed(slow)
 
 
+def test_a_large_request_may_take_longer_while_it_arrives(serve_world, monkeypatch):
+    monkeypatch.setattr(http_server, "REQUEST_S", 0.5)
+    monkeypatch.setattr(http_server, "RENEWS", 1000)
+    with raw(serve_world()) as slow:
+        slow.sendall(b"POST /icon.svg HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9000\r\n\r\n")
+        for _ in range(6):
+            time.sleep(0.2)
+            slow.sendall(b"x" * 1500)
+        assert slow.recv(100).startswith(b"HTTP/1.1 405")
+
+
 def test_a_second_request_has_a_deadline_too(serve_world, monkeypatch):
     monkeypatch.setattr(http_server, "REQUEST_S", 0.5)
     server = serve_world()

@@ -35,7 +35,8 @@ from .guard import Guard, is_loopback
 
 WEB = Path(__file__).parent / "web"
 KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-REQUEST_S = 10.0  # from the first to the last byte of a request
+REQUEST_S = 10.0  # from the first to the last byte of a request, and for each further RENEWS bytes of it
+RENEWS = 1 << 18  # a picture from a telephone takes longer than a request
 MOST_WAITING = 64  # connections with an unfinished request; beyond it the oldest is dropped
 COMPLAIN_EVERY_S = 60.0
 
@@ -136,12 +137,12 @@ def application(
 
 async def posted(request: Request, most: int) -> bytes:
     """The body of a POST; ServeError for more than `most` bytes."""
-    content = b""
+    content = bytearray()
     async for part in request.stream():
         content += part
         if len(content) > most:
             raise ServeError(f"more than {most:,} bytes were sent at once; send less.")
-    return content
+    return bytes(content)
 
 
 class PageApplication(Protocol):
@@ -219,8 +220,8 @@ def quiet_accepting(loop: asyncio.AbstractEventLoop) -> None:
 
 
 class GuardedConnection(H11Protocol):
-    """uvicorn's connection with a deadline for receiving each request. A complete request has no deadline, nor has a WebSocket
-    once it takes over the connection."""
+    """uvicorn's connection with a deadline for receiving each request, which moves on while a large one arrives. A complete request
+    has no deadline, nor has a WebSocket once it takes over the connection."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         super().connection_made(transport)
@@ -231,7 +232,8 @@ class GuardedConnection(H11Protocol):
         self._await_request()
 
     def data_received(self, data: bytes) -> None:
-        if self not in self._waiting:
+        self._received += len(data)
+        if self not in self._waiting or self._received > RENEWS:
             self._await_request()
         super().data_received(data)
         if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
@@ -251,6 +253,9 @@ class GuardedConnection(H11Protocol):
         self.transport.abort()
 
     def _await_request(self) -> None:
+        self._received = 0
+        if (timer := self._waiting.get(self)) is not None:
+            timer.cancel()
         self._waiting[self] = self.loop.call_later(REQUEST_S, self.drop)
 
     def _stop_waiting(self) -> None:
