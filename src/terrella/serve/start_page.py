@@ -16,6 +16,7 @@ from starlette.routing import Route
 from starlette.types import Receive, Scope, Send
 
 from ..core.errors import ServeError, TerrellaError
+from ..space.layout.drawn_plan import DOOR_M, WINDOW_M
 from ..space.layout.furniture import KINDS
 from ..space.layout.text_layout import ROOMS
 from .http_server import WEB, application, posted, serve_page
@@ -124,8 +125,8 @@ class StartPage:
     async def _kinds(self, request: Request) -> Response:
         """The rooms and the things of a plan, with their usual sizes in metres."""
         things = {
-            "door": (0.95, 0.15),
-            "window": (1.5, 0.15),
+            "door": (DOOR_M, 0.15),
+            "window": (WINDOW_M, 0.15),
             **{name: kind.size[:2] for name, kind in sorted(KINDS.items())},
         }
         return JSONResponse({"rooms": {name: {"size": one["size"]} for name, one in ROOMS.items()},
