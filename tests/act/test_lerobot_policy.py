@@ -216,8 +216,14 @@ def test_a_python_without_lerobot_and_a_failing_one_are_sentences(folder, world,
     monkeypatch.setenv(PYTHON, str(tmp_path / "python"))
     with pytest.raises(CheckpointError, match=f"cannot be started .*{PYTHON}"):
         terrella.load_policy(saved(tmp_path / "b"), world.spec)
+    monkeypatch.setenv(PYTHON, sys.executable)
+    monkeypatch.delenv("PYTHONPATH")
+    with pytest.raises(CheckpointError, match=f"does not run .*named 'lerobot'.: install lerobot 0.4.4 .* in {PYTHON}"):
+        terrella.load_policy(saved(tmp_path / "d"), world.spec)
     monkeypatch.delenv(PYTHON)
-    with pytest.raises(CheckpointError, match=f"install lerobot 0.4.4 .* in {PYTHON}"):
+    (tmp_path / "here/lerobot").mkdir(parents=True)  # an environment, as the guide makes it
+    monkeypatch.syspath_prepend(str(tmp_path / "here"))
+    with pytest.raises(CheckpointError, match=f"own code: install lerobot 0.4.4 .* in {PYTHON}"):
         terrella.load_policy(saved(tmp_path / "c"), world.spec)
 
 

@@ -201,6 +201,10 @@ class LerobotProcess:
         try:
             self._answer()
         except TerrellaError as error:
+            if "No module named" in str(error):
+                raise CheckpointError(
+                    f"{python} does not run {folder} ({str(error).rstrip('.')}): {_ADVICE}."
+                ) from None
             raise CheckpointError(f"{folder} does not load in LeRobot: {error}") from None
 
     @property
@@ -252,7 +256,8 @@ def _started(python: str, folder: Path, changed: object) -> LerobotProcess:
 
 
 def _python(place: Path) -> str:
-    python = os.environ.get(PYTHON) or (sys.executable if find_spec("lerobot") else "")
+    installed = find_spec("lerobot")  # without an origin it is a folder of that name where one works
+    python = os.environ.get(PYTHON) or (sys.executable if installed and installed.origin else "")
     if not python:
         raise CheckpointError(f"{place} is a policy of LeRobot, which runs in LeRobot's own code: {_ADVICE}.")
     return python
