@@ -123,6 +123,9 @@ def test_evaluate_prints_a_verdict_and_a_page_lets_it_drive(folder, world, capsy
     assert "In the dream the best of 2 is policy" in said and "random (baseline)" in said
     agents = PageAgents(world, name=str(folder)).agents()
     assert isinstance(agents.make({}).policy, LerobotPolicy) and agents.words is None
+    for words in (["practise", str(folder), "--goal", "state=0,0"], ["evaluate", str(folder), "--best-of", "2"]):
+        assert main([*words, "--in", NAME, "--out", str(tmp_path / "other")]) == 2
+        assert "is a policy of kind 'lerobot'" in capsys.readouterr().err
     assert play(world, terrella.load_policy(f"{folder}@0.5", world.spec), 2, PlaySettings(4)).episodes
 
 

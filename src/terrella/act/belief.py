@@ -11,10 +11,10 @@ from ..core.spec import Spec
 from ..core.state import State
 from ..core.world import Observation, World
 from . import imitation
-from .actor import Actor, policy_folder, read_policy
+from .actor import Actor
 from .goal_network import KIND, GoalActor
 from .imitation import ImitationActor
-from .lerobot_policy import LerobotPolicy, lerobot_folder
+from .lerobot_policy import LEROBOT, LerobotPolicy, kind_of_policy
 from .planning import Cost, GoalBeliefPolicy
 from .skills.actor import SkillActor
 from .skills.library import KIND as SKILLS
@@ -43,9 +43,9 @@ def load_learned_policy(folder: str | Path, spec: Spec, world: World | None = No
     """The learned policy of a folder, ours or LeRobot's, for the actions of `spec`. One that sees channels which only `world` has
     acts through the world; a goal-conditioned one acts towards the goal of `cost`. ActionError, ChannelError or PlanningError if
     it does not fit."""
-    if lerobot_folder(folder):
+    kind = kind_of_policy(folder)
+    if kind == LEROBOT:
         return LerobotPolicy.load(folder, spec)
-    kind = read_policy(policy_folder(folder)).get("kind")
     if kind == imitation.KIND:
         return ImitationActor.load(folder, spec)
     if kind == SKILLS:

@@ -10,8 +10,9 @@ from ..core.state import State
 from ..core.world import Observation, World
 from . import imitation
 from .actor import KIND as ACTOR
-from .actor import Actor, policy_folder, read_policy
+from .actor import Actor
 from .imitation import ImitationActor
+from .lerobot_policy import kind_of_policy
 from .planning import SuccessCriterion
 
 HORIZON, REPLAN = 24, 4  # steps of a plan, and of these executed before the next
@@ -129,7 +130,7 @@ def _inner(own: dict[str, torch.Tensor]) -> State | None:
 
 def best_of(folder: str, count: int, world: World, criterion: SuccessCriterion) -> BestOf:
     """The best of `count` plans of the policy in a folder. PlanningError for a kind of policy that draws nothing."""
-    kind = read_policy(policy_folder(folder)).get("kind")
+    kind = kind_of_policy(folder)
     if kind == imitation.KIND:
         usual = ImitationActor.load(folder, world.spec)
         return BestOf(world, usual, ImitationActor(usual.network, world.spec, std=0.0), count, criterion)

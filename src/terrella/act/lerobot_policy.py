@@ -26,10 +26,10 @@ from ..core.feature_names import features_of
 from ..core.spec import Spec, dtype_of, shape_of
 from ..core.world import Observation
 from . import lerobot_program
-from .actor import POLICY_FILE
+from .actor import POLICY_FILE, policy_folder, read_policy
 
 PYTHON = "TERRELLA_LEROBOT_PYTHON"  # environment variable: the Python that has lerobot
-KINDS = ("act", "diffusion")
+LEROBOT, KINDS = "lerobot", ("act", "diffusion")
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _ADVICE = f"install lerobot 0.4.4 in an environment of its own, and name the Python of that in {PYTHON}"
@@ -118,6 +118,12 @@ def lerobot_folder(folder: str | Path) -> Path | None:
             if isinstance(saved, dict) and "type" in saved and "input_features" in saved:
                 return place
     return None
+
+
+def kind_of_policy(folder: str | Path) -> Any:
+    """The kind of the policy in a folder or in that of its training run, LEROBOT for one of LeRobot. CheckpointError if there is
+    none."""
+    return LEROBOT if lerobot_folder(folder) else read_policy(policy_folder(folder)).get("kind")
 
 
 @final

@@ -18,12 +18,11 @@ from ..core.policy import Constant, Idle, Policy, Random, Reactive, observed_cha
 from ..core.similar import did_you_mean
 from ..core.spec import AXES, BUTTONS, Spec, shape_of
 from ..core.world import Observation, World
-from .actor import policy_folder, read_policy
 from .belief import load_learned_policy
 from .driver import driver_of
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
-from .lerobot_policy import lerobot_folder
+from .lerobot_policy import kind_of_policy
 from .planning import Cost, Planner, SearchConfig, negative_reward
 from .planning.searches import Kind
 from .teacher import teacher_of
@@ -74,8 +73,7 @@ def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | No
 
 def proposal_policy(name: str, world: World) -> Policy:
     """A policy, by name, whose plans a search in `world` evaluates as well; a goal-conditioned one gets the search's goal."""
-    folder = policy_folder(name)
-    if folder.is_dir() and not lerobot_folder(name) and read_policy(folder).get("kind") == KIND:
+    if Path(name).is_dir() and kind_of_policy(name) == KIND:
         return GoalActor.load(name, world.spec, varied=True)
     return policy_of(name, world.spec, world)
 

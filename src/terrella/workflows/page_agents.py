@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from .. import library
-from ..act.actor import policy_folder, read_policy
 from ..act.explorer import Explorer
 from ..act.imitation import KIND, ImitationActor
-from ..act.lerobot_policy import lerobot_folder
+from ..act.lerobot_policy import kind_of_policy
 from ..act.planning import (
     STRIDE_S,
     Destination,
@@ -89,8 +89,8 @@ class PageAgents:
     @cached_property
     def _spec(self) -> Spec:
         """The spec for the policy: where the world gives no instructions to one that imitates, the person may."""
-        spec, folder = self.played.spec, policy_folder(self.name)
-        if lerobot_folder(folder) or not folder.is_dir() or read_policy(folder).get("kind") not in (KIND, SKILLS):
+        spec = self.played.spec
+        if not Path(self.name).is_dir() or kind_of_policy(self.name) not in (KIND, SKILLS):
             return spec
         return replace(spec, channels={**spec.channels, TEXT_CHANNEL: TEXT})
 

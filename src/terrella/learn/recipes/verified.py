@@ -12,8 +12,9 @@ import torch
 
 from ...act import imitation
 from ...act.actor import KIND as ACTOR
-from ...act.actor import RUN_SUBFOLDER, Actor, policy_folder, read_policy
+from ...act.actor import RUN_SUBFOLDER, Actor
 from ...act.imitation import ImitationActor
+from ...act.lerobot_policy import kind_of_policy
 from ...act.planning import SuccessCriterion
 from ...core.errors import PlanningError, TrainingError
 from ...core.world import World, make_rng
@@ -59,7 +60,7 @@ Practised = ImitationActor | Actor
 def load_practised(folder: str | Path, world: World, std: float) -> Practised:
     """The policy of a folder, which draws its actions. TrainingError for a kind that cannot be fine-tuned; ActionError or
     ChannelError if it does not fit the world."""
-    kind = read_policy(policy_folder(folder)).get("kind")
+    kind = kind_of_policy(folder)
     if kind == imitation.KIND:
         loaded = ImitationActor.load(folder, world.spec)
         return ImitationActor(loaded.network, world.spec, loaded.card, std)
