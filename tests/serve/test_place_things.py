@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import urllib.error
+import urllib.request
 
 import pytest
 import torch
@@ -129,6 +131,28 @@ def test_a_thing_is_put_on_the_page_moved_by_handles_and_saved(tmp_path, opened,
     assert page.evaluate("terrella.story.scene.length") == 1500
     page.reload()
     until(page, "!!window.terrella && terrella.story.edits.length === 4")
+
+
+def test_what_a_page_posts_reaches_its_own_place_alone(tmp_path, serving):  # noqa: F811
+    for name in "ab":
+        save_splat(world(300), tmp_path / name)
+    a, b = (editable_place(str(tmp_path / name)) for name in "ab")
+    url, [edit] = serving(build_place(b)), put_things(tmp_path / "b", "a stool", Spot((1.0, 1.0, 0.0), 0.0)).edits
+
+    def posted(path: str, **wish) -> tuple[int, str]:
+        request = urllib.request.Request(url + path, json.dumps(wish).encode(), {"Host": "localhost"})
+        try:
+            return 200, urllib.request.urlopen(request).read().decode()
+        except urllib.error.HTTPError as error:
+            return error.code, error.read().decode()
+
+    thing = {"words": "a stool", "spot": {"at": [1, 1, 0], "floor": 0, "degrees": 0}}
+    lines = {"saved": "", "lines": json.dumps(edit)}  # put before the server was started anew
+    for path, wish in (("edits", lines), ("things", thing), ("files", {"kind": "spz"})):
+        status, said = posted(path, **wish, key=a.key)  # of a tab whose place was open before
+        assert status == 422 and "has opened another place since" in said
+    assert not read_edits(tmp_path / "b") and posted("edits", **lines, key=b.key) == (200, "")
+    assert read_edits(tmp_path / "b") == [edit]
 
 
 def test_words_that_name_nothing_and_spots_that_are_none_are_refused(tmp_path, opened, serving):  # noqa: F811

@@ -41,6 +41,7 @@ FIRST = 50_000  # of a larger place this many, spread evenly, are sent first; th
 LONGEST_EDITS = 1 << 22  # bytes
 LONGEST_WISH = 1 << 14  # bytes of a request for things or for a file
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
+_OWN = re.compile(r"things/[\w-]+")  # a thing that was put into this place, perhaps before the server was started anew
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
 
 
@@ -76,7 +77,8 @@ class PlacePage:
     ) -> bytes:
         """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
         the address of newer states of a place that is being fitted, without editing; frames: the address that renders for browsers
-        that cannot; more: other addresses of a server: `things`, which builds what words name, and `files`, which writes files."""
+        that cannot; more: other addresses of a server: `things`, which builds what words name, and `files`, which writes files;
+        `key` goes with all that the page posts."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
@@ -232,6 +234,7 @@ class EditablePlace:
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
     put: Callable[[str, Spot], PutThings] | None = None  # builds what words name; may raise a TerrellaError
     export: Callable[[Mapping[str, Any]], bytes] | None = None  # writes a file; may raise a TerrellaError
+    key: str = ""  # tells its page's requests from those of a page whose place the server showed before
 
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
@@ -242,26 +245,37 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     writing = threading.Lock()  # one file at a time, while edits go on
     frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
 
+    def wished(content: bytes) -> Mapping[str, Any]:
+        """What a page posts, if it is the page of this place."""
+        wish = json.loads(content)
+        if wish.get("key", place.key) != place.key:
+            raise ServeError(
+                "the server has opened another place since; open this one from the start page in a new tab, then try again here."
+            )
+        return wish
+
     def save(content: bytes) -> None:
-        posted_edits = json.loads(content)
+        posted_edits = wished(content)
         with lock:
             if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
             lines = [json.loads(line) for line in posted_edits["lines"].splitlines() if line]
-            if any(_merge_key(edit) not in page.merged for edit in merges_of(lines)):
+            if any(
+                _merge_key(edit) not in page.merged and not _OWN.fullmatch(edit["place"]) for edit in merges_of(lines)
+            ):
                 raise ServeError(
                     "this page merges only the place that it was opened beside: `terrella space view PLACE --beside OTHER`."
                 )
             place.save(posted_edits["lines"])
 
     def write_file(content: bytes) -> bytes:
-        wish = json.loads(content)
+        wish = wished(content)
         assert place.export is not None
         with writing:
-            return place.export({**wish})
+            return place.export(wish)
 
     def build_things(content: bytes) -> bytes:
-        wish = json.loads(content)
+        wish = wished(content)
         assert place.put is not None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
@@ -284,7 +298,9 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
     routes += [Route("/things", put, methods=["POST"])] if place.put else []
     routes += [Route("/files", write, methods=["POST"])] if place.export else []
-    more = {name: f"/{name}" for name, does in (("things", place.put), ("files", place.export)) if does}
+    more = {"key": place.key} | {
+        name: f"/{name}" for name, does in (("things", place.put), ("files", place.export)) if does
+    }
     html = lambda: page.html(place.edits(), "/edits", frames="/frame", more=more)  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
 

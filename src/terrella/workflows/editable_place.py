@@ -1,5 +1,6 @@
 """Opens a place of Gaussians for its page: what is edited there is saved in the place."""
 
+import hashlib
 from pathlib import Path
 
 from ..core.errors import ContractError
@@ -26,6 +27,7 @@ def editable_place(world: str, beside: str | None = None) -> EditablePlace:
         None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
         lambda words, spot: put_things(folder, words, spot),
         lambda wish: exported_file(world, wish),
+        hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
     )
 
 

@@ -78,13 +78,13 @@ function run({ drawing, source, story, solid: first }) {
   const compare = new Compare(redraw);
   const editor = new Editor(story, drawing, {
     changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look,
-    solid: () => solid, body: world.body, put: world.things, command: world.command,
+    solid: () => solid, body: world.body, put: world.things, command: world.command, key: world.key,
   });
 
   const film = new Film($('film'), {
     eye: () => walker.eye, stand: ([x, y, z, heading, pitch]) => { if (orbit.on) turnAround(); walker.set([x, y, z], heading, pitch, true); redraw(); },
     picture, unsaved: () => story.unsaved, expose: (stops) => { drawing.stops = stops; redraw(); }, redraw: () => redraw(), say: toast,
-    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', address: world.files, command: world.command,
+    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', address: world.files, command: world.command, key: world.key,
   });
 
   /** The view as a picture, without lines: a blob of PNG. */
@@ -312,7 +312,7 @@ function run({ drawing, source, story, solid: first }) {
 /** Keeps edits: at the server that showed this page, or as a file. */
 async function keep(lines, saved) {
   if (world.save) {
-    await reach(world.save + location.search, world.command, { method: 'POST', body: JSON.stringify({ saved, lines }) });
+    await reach(world.save + location.search, world.command, { method: 'POST', body: JSON.stringify({ saved, lines, key: world.key }) });
     toast('Saved with the place.');
     return;
   }

@@ -17,8 +17,8 @@ const SAID = {
 const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 
 export class Editor {
-  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), solid(), body, say(text), keep(lines) -> promise, look(dx, dy); put and
-   * command: the address that builds things, and what starts its server. */
+  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), solid(), body, say(text), keep(lines) -> promise, look(dx, dy); put,
+   * command and key: the address that builds things, what starts its server, and what goes with a request. */
   constructor(story, drawing, on) {
     Object.assign(this, { story, drawing, on, chosen: null, mask: null, open: false });
     this.selecting = new Selecting({
@@ -28,7 +28,7 @@ export class Editor {
     });
     this.gizmo = new Gizmo($('gizmo'), { eye: on.eye, lens: on.lens, preview: (change) => this.preview(change), act: (action) => this.act(action) });
     this.put = new Put($('putting'), {
-      scene: () => story.scene, solid: on.solid, eye: on.eye, body: on.body, address: on.put, command: on.command, say: on.say, put: (edits, scenes) => this.merge(edits, scenes),
+      scene: () => story.scene, solid: on.solid, eye: on.eye, body: on.body, address: on.put, command: on.command, key: on.key, say: on.say, put: (edits, scenes) => this.merge(edits, scenes),
     });
     document.querySelector('[data-tool=put]').hidden = !on.put;
     document.querySelectorAll('[data-tool]').forEach((button) => { button.onclick = () => this.take(button.dataset.tool); });

@@ -18,7 +18,7 @@ export function glideAt(views, share) {
 
 export class Film {
   /** panel: its parts are named by data-film and data-file; on: eye(), stand(view), picture() -> promise of a blob, unsaved(), expose(stops),
-   * redraw(), say(text), name, address, command. */
+   * redraw(), say(text), name, address, command, key. */
   constructor(panel, on) {
     Object.assign(this, { panel, on, views: [], playing: 0, open: false });
     const part = (name) => panel.querySelector(`[data-film=${name}]`);
@@ -95,7 +95,7 @@ export class Film {
     if (kind !== 'png' && this.on.unsaved()) { this.on.say('Files are of the saved place; save the edits first.'); return; }
     if (kind === 'mp4' && this.views.length < FEWEST) { this.on.say('A film needs a path: keep two views or more (K).'); return; }
     const degrees = (angle) => round((angle * 180) / Math.PI), path = this.path.map(([x, y, z, heading, pitch]) => [...[x, y, z].map(round), degrees(heading), degrees(pitch)]);
-    const wish = kind === 'mp4' ? { kind, path, seconds: this.seconds, exposure: this.stops } : { kind };
+    const wish = { kind, key: this.on.key, ...(kind === 'mp4' && { path, seconds: this.seconds, exposure: this.stops }) };
     button.disabled = true;
     this.parts.state.textContent = kind === 'mp4' ? `Drawing ${Math.round(30 * this.seconds)} pictures …` : `Writing the ${button.textContent} …`;
     try {

@@ -28,7 +28,7 @@ function normalOf(scene, k, way) {
 }
 
 export class Put {
-  /** form: its field and its button; on: scene(), solid(), eye(), body, address, command, say(text), put(edits, scenes by sha256). */
+  /** form: its field and its button; on: scene(), solid(), eye(), body, address, command, key, say(text), put(edits, scenes by sha256). */
   constructor(form, on) {
     Object.assign(this, { form, on, spot: null });
     form.onsubmit = (event) => { event.preventDefault(); this.ask(); };
@@ -44,7 +44,7 @@ export class Put {
     if (!this.spot) this.choose();
     button.disabled = true;
     try {
-      const body = JSON.stringify({ words, spot: this.spot }), answer = await reach(this.on.address + location.search, this.on.command, { method: 'POST', body });
+      const body = JSON.stringify({ words, spot: this.spot, key: this.on.key }), answer = await reach(this.on.address + location.search, this.on.command, { method: 'POST', body });
       const { things, unknown } = await answer.json(), scenes = new Map();
       for (const { edit, about, data } of things) if (!scenes.has(edit.sha256)) scenes.set(edit.sha256, unpackScene(new Reader(await inflate(decoded(data))), about));
       this.on.put(things.map(({ edit }) => edit), scenes);
