@@ -245,17 +245,8 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     writing = threading.Lock()  # one file at a time, while edits go on
     frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
 
-    def wished(content: bytes) -> Mapping[str, Any]:
-        """What a page posts, if it is the page of this place."""
-        wish = json.loads(content)
-        if wish.get("key", place.key) != place.key:
-            raise ServeError(
-                "the server has opened another place since; open this one from the start page in a new tab, then try again here."
-            )
-        return wish
-
     def save(content: bytes) -> None:
-        posted_edits = wished(content)
+        posted_edits = _wished(place, content)
         with lock:
             if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
@@ -269,13 +260,13 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
             place.save(posted_edits["lines"])
 
     def write_file(content: bytes) -> bytes:
-        wish = wished(content)
+        wish = _wished(place, content)
         assert place.export is not None
         with writing:
             return place.export(wish)
 
     def build_things(content: bytes) -> bytes:
-        wish = wished(content)
+        wish = _wished(place, content)
         assert place.put is not None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
@@ -303,6 +294,16 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     }
     html = lambda: page.html(place.edits(), "/edits", frames="/frame", more=more)  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
+
+
+def _wished(place: EditablePlace, content: bytes) -> Mapping[str, Any]:
+    """What a page posts, if it is the page of this place."""
+    wish = json.loads(content)
+    if wish.get("key", place.key) != place.key:
+        raise ServeError(
+            "the server has opened another place since; open this one from the start page in a new tab, then try again here."
+        )
+    return wish
 
 
 async def _answer(request: Request, most: int, work: Callable[[bytes], bytes | None], form: str) -> Response:
