@@ -49,12 +49,7 @@ def test_the_contract_holds(table):
 def test_the_teacher_does_every_task(task):
     world = terrella.load(f"mujoco:table:{task}", **BLIND)
     state = played(world, "teacher:0.1", 2, seed=1)
-    assert (
-        state["success"].all()
-        and state["done"].all()
-        and state["reward"].tolist() == [0, 0]
-        or state["reward"].max() == 1
-    )
+    assert state["success"].all() and state["done"].all()
     assert {TASKS[at] for at in state["job"][:, 0].tolist()} == {task}
 
 
