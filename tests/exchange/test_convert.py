@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -244,6 +245,11 @@ def test_subtasks_of_lerobots_annotations_become_instructions(tmp_path):
     assert [note for note in opened.notes if "annotations" in note and "subtasks are kept" in note] == list(
         opened.notes
     )
+    info = json.loads((tmp_path / "theirs/meta/info.json").read_text())
+    del info["features"]["language_persistent"]
+    shutil.copytree(tmp_path / "theirs", tmp_path / "events")
+    (tmp_path / "events/meta/info.json").write_text(json.dumps(info))
+    assert "of the annotations in language_events nothing is kept." in open_source(tmp_path / "events").notes
     (again,) = opened.takes()
     assert again.facts["language"] == [[0.0, "open"], [0.25, "close"]] and again.task == "tidy up"
     write_source(opened, tmp_path / "ours")

@@ -39,8 +39,10 @@ def read(root: str | Path, fps: float | None = None) -> Source:
         unlisted += [f"the camera '{name}'" for name in cameras if name not in data.features]
     notes = [f"{what} is not in info.json and was left out." for what in unlisted]
     if annotations := [name for name in (PERSISTENT, EVENTS) if name in data.info["features"]]:
-        where = " and ".join(annotations)
-        notes.append(f"of the annotations in {where} the subtasks are kept, as instructions in place of the task.")
+        where, kept = " and ".join(annotations), "nothing is kept"
+        if PERSISTENT in annotations:
+            kept = "the subtasks are kept, as instructions in place of an episode's only task"
+        notes.append(f"of the annotations in {where} {kept}.")
     return replace(data.source(), notes=tuple(notes))
 
 
