@@ -26,12 +26,21 @@ def tensor_programs() -> Iterator[None]:
         _tensors_alone = before
 
 
-@lru_cache(maxsize=512, typed=True)
 def constant(make: Callable[..., torch.Tensor], device: torch.device, *given: Hashable) -> torch.Tensor:
     """`make(*given)` on a device, made once: a constant that would be written by kernels, or copied to the device, at every step.
     Nobody may write to it."""
+    return _made(make, device, _types(given), *given)
+
+
+@lru_cache(maxsize=512)
+def _made(make: Callable[..., torch.Tensor], device: torch.device, types: Hashable, *given: Hashable) -> torch.Tensor:
     with torch.inference_mode(False), torch.no_grad():
         return make(*given).to(device)
+
+
+def _types(given: tuple[Hashable, ...]) -> Hashable:
+    """The types of numbers, also in tuples: (1,) and (1.0,) are equal, and make tensors of other types."""
+    return tuple(_types(one) if isinstance(one, tuple) else type(one) for one in given)
 
 
 def table(*rows: Any) -> torch.Tensor:
