@@ -105,8 +105,8 @@ def test_a_thing_is_put_on_the_page_moved_by_handles_and_saved(tmp_path, opened,
     assert page.evaluate("document.getElementById('toast').textContent") == "Not understood: wobbly."
     number = page.evaluate("terrella.editor.chosen.object")
     assert page.inner_text("#count").endswith("stool") and page.is_visible("#gizmo")
-    for key in ("ArrowUp", "ArrowUp", "PageUp", "BracketLeft"):  # in a row: one move, and one turn
-        page.keyboard.press(key)
+    keys = ["ArrowUp", "ArrowUp", "PageUp", "BracketLeft"]  # in a row: one move, and one turn
+    page.evaluate("keys => keys.forEach((code) => dispatchEvent(new KeyboardEvent('keydown', { code })))", keys)
     until(page, "terrella.story.edits.length === 3")
     turned, moved = page.evaluate("terrella.story.edits.slice(1)")
     assert turned == {"select": {"object": number}, "do": "turn", "degrees": 15}
@@ -131,6 +131,18 @@ def test_a_thing_is_put_on_the_page_moved_by_handles_and_saved(tmp_path, opened,
     assert page.evaluate("terrella.story.scene.length") == 1500
     page.reload()
     until(page, "!!window.terrella && terrella.story.edits.length === 4")
+
+
+def test_what_keys_moved_stays_moved_whatever_comes_next(tmp_path, opened, serving):  # noqa: F811
+    save_splat(world(300), tmp_path / "w")
+    page = opened(serving(build_place(editable_place(str(tmp_path / "w")))), size=(300, 200))
+    page.keyboard.press("KeyE")
+    edits = "(() => { const { editor, story } = terrella; %s; return story.edits.map((edit) => edit.do); })()"
+    key = "dispatchEvent(new KeyboardEvent('keydown', { code: '%s' })); "
+    page.evaluate("terrella.editor.choose({ object: 1 })")
+    assert page.evaluate(edits % (key % "ArrowUp" + "editor.choose({ object: 2 })")) == ["move"]
+    assert page.evaluate(edits % (key % "BracketLeft" + "document.getElementById('undo').click()")) == ["move"]
+    assert page.evaluate(edits % (key % "PageUp" + "editor.toggle()")) == ["move", "move"]
 
 
 def test_what_a_page_posts_reaches_its_own_place_alone(tmp_path, serving):  # noqa: F811

@@ -49,6 +49,7 @@ export class Editor {
   }
 
   toggle() {
+    this.gizmo.commit();
     this.open = !this.open;
     $('editor').hidden = !this.open;
     $('edit').setAttribute('aria-pressed', this.open);
@@ -80,6 +81,7 @@ export class Editor {
   }
 
   choose(chosen) {
+    this.gizmo.commit();
     const mask = chosen && select(this.story.scene, chosen);
     Object.assign(this, { chosen, mask: mask?.count ? mask : null });
     this.hold();
@@ -123,6 +125,7 @@ export class Editor {
 
   /** Does something to the story, and shows what came of it. */
   change(does, { by, chosen, do: action } = {}) {
+    this.gizmo.commit();
     try { does(); } catch (error) { this.on.say(error.message); return; }
     this.preview({});
     this.on.changed(this.story.scene);
@@ -132,6 +135,7 @@ export class Editor {
   }
 
   async save() {
+    this.gizmo.commit();
     const { lines } = this.story;
     await this.on.keep(lines, this.story.saved).then(() => { this.story.saved = lines; }, (error) => this.on.say(error.message));
     this.show();

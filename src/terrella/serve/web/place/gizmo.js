@@ -81,7 +81,7 @@ export class Gizmo {
     this.on.preview({ move: wish.move, turn: (wish.degrees * Math.PI) / 180 });
   }
 
-  /** Makes edits of what was dragged. */
+  /** Makes edits of what was dragged, or moved by keys a moment ago. */
   commit() {
     const { wish } = this;
     this.wish = null;
