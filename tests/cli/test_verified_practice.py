@@ -123,6 +123,11 @@ def test_other_policies_are_refused(policy, capsys, tmp_path):
     assert "CartPole" in capsys.readouterr().err
     assert main(["practise", str(tmp_path / "none"), "--in", BLIND, *GOAL]) == 2
     assert "there is no folder" in capsys.readouterr().err
+    before = (policy / "run/policy/weights.safetensors").read_bytes()
+    for name in ("run", "run/policy"):
+        assert main(["practise", str(policy / name), "--in", BLIND, *GOAL, "--out", str(policy / "run"), *SMALL]) == 2
+        assert "holds the policy itself" in capsys.readouterr().err
+    assert (policy / "run/policy/weights.safetensors").read_bytes() == before
     (tmp_path / "policy.json").write_text('{"kind": "goal-actor"}')
     assert main(["practise", str(tmp_path), "--in", BLIND, *GOAL]) == 2
     assert "'goal-actor'; practice fine-tunes policies by" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import torch
 
+from ..act.actor import RUN_SUBFOLDER, policy_folder
 from ..act.paired_evaluation import CHUNK
 from ..act.planning import SuccessCriterion
 from ..act.planning.costs import checked_goal
@@ -78,7 +79,7 @@ def practise_by_rule(
     TerrellaError for what cannot be practised.
     """
     inside, folder = str(world), Path(config.out or f"practised/{folder_name(str(policy))}")
-    _check(policy, config)
+    _check(policy, folder, config)
     evaluated = EvaluateConfig(
         config.real, config.environment, config.episodes, config.steps, within=config.within, device="cpu",
         seed=config.practice.seed,
@@ -101,7 +102,7 @@ def practise_by_rule(
         arms[arm] = str(run)
         practice = replace(practice, updates=facts["step"], minutes=None)  # the blind arm practises as much
     log = EvaluationLog(
-        folder / "evaluation", _settings(inside, config, settings_of(inside, evaluated, study)),
+        folder / "evaluation", settings_of(inside, evaluated, study) | _what_succeeds(config),
         {name: fingerprint(Path(name) / "policy" if arm != BEFORE else name) for arm, name in arms.items()},
     )  # fmt: skip
     play_policies(study, log, tuple(arms.values()), config.episodes, progress)
@@ -111,13 +112,15 @@ def practise_by_rule(
     return result
 
 
-def _settings(world: str, config: VerifiedPracticeConfig, settings: dict[str, Any]) -> dict[str, Any]:
-    return {**settings, "goal": list(config.goal), "success": config.success, "reward": config.reward, "in": world}
+def _what_succeeds(config: VerifiedPracticeConfig) -> dict[str, Any]:
+    return {"goal": list(config.goal), "success": config.success, "reward": config.reward}
 
 
-def _check(policy: str | Path, config: VerifiedPracticeConfig) -> None:
+def _check(policy: str | Path, out: Path, config: VerifiedPracticeConfig) -> None:
     if not Path(policy).is_dir():
         raise TerrellaError(f"there is no folder {policy}: give the folder of a policy by `terrella train policy`.")
+    if (out / RUN_SUBFOLDER).resolve() == policy_folder(policy).resolve():
+        raise TerrellaError(f"{out} holds the policy itself, which the gain is measured against; give another --out.")
     if config.episodes < 1 or (config.steps is not None and config.steps < 1) or not config.within > 0:
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up, and --within is above 0.")
     if not config.goal and not config.success:
