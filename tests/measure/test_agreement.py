@@ -148,4 +148,6 @@ def test_without_reality_the_dream_alone_is_told():
     alone = {name: {arm: found for arm, found in arms.items() if arm != "real"} for name, arms in scores.items()}
     found = evaluate_policies(alone, {}, names, 0)
     assert found.dream is None and "In the dream the best of 10 is p9" in verdict(found)[0]
+    same = evaluate_policies(dict.fromkeys(("one", "two"), alone["p9"]), {}, ["one", "two"], 0)
+    assert "In the dream the best of 2 are one, two alike, return" in verdict(same)[0]
     assert "--real" in verdict(found)[0] and "<svg" in policy_evaluation_page("x", found, {})

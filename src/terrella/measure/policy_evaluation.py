@@ -154,11 +154,12 @@ def verdict(evaluation: PolicyEvaluation) -> list[str]:
     say = percent if evaluation.what == SUCCESS else with_interval
     rows, count = evaluation.rows, len(evaluation.policies)
     if evaluation.dream is None:
-        best = max(evaluation.policies, key=lambda name: rows[name][DREAM].value)
+        most = max(rows[name][DREAM].value for name in evaluation.policies)
+        best, *alike = (name for name in evaluation.policies if rows[name][DREAM].value == most)
         floor = f"; acting at random {say(rows[RANDOM][DREAM])}" if RANDOM in rows and best != RANDOM else ""
         hint = "give --real ENV to compare with reality."
-        best = f"{best}, {evaluation.what} {say(rows[best][DREAM])}"
-        return [f"In the dream the best of {count} is {best}{floor}; {hint}"]
+        names = f"are {', '.join([best, *alike])} alike" if alike else f"is {best}"
+        return [f"In the dream the best of {count} {names}, {evaluation.what} {say(rows[best][DREAM])}{floor}; {hint}"]
     lines = [_ranking(evaluation)]
     if count >= LEAST:
         lines += [_figures("dream", evaluation.dream, evaluation), _control(evaluation)]
