@@ -82,6 +82,8 @@ def test_a_door_between_rooms_comes_where_nothing_stands():
     plan = planned(things=things).layout
     [door], [wardrobe] = plan.doors, plan.things
     assert 1.06 + door.width / 2 < 0.06 + door.at < wardrobe.at[1] - wardrobe.size[0] / 2 - door.width / 2 < middle
+    (door,) = planned(things=[{"label": "picture", "at": [4.1, 2.9]}]).layout.doors
+    assert 0.06 + door.at < 2.9 - 0.45 - door.width / 2
     (door,) = planned(things=[{"label": "rug", "at": [3.7, 2.6]}]).layout.doors
     assert door.at + 0.06 == pytest.approx(middle)
 

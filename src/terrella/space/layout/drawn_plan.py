@@ -165,7 +165,9 @@ def _free(layout: Mapping[str, Any], room: Mapping[str, Any], axis: int, span: t
         before = abs(one["at"][axis] - wall) < halves[axis] + CLEAR_M
         return before and abs(one["at"][1 - axis] - at) < halves[1 - axis] + DOOR_M / 2 + 0.1
 
-    solid = [one for one in layout["things"] if one["at"][2] < 2 and not KINDS[one["label"]].soft]
+    solid = [
+        one for one in layout["things"] if one["at"][2] < 2 and (one["at"][2] or not KINDS[one["label"]].soft)
+    ]  # no rugs
     ways = sorted((middle + slack * k / 10 for k in range(-10, 11)), key=lambda at: abs(at - middle))
     return next((at for at in ways if not any(bars(one, at) for one in solid)), middle)
 
