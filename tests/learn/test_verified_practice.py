@@ -152,6 +152,9 @@ def test_what_is_never_reached_is_refused_before_training():
     far = SuccessCriterion({"observation": torch.full((1, 2), 9.0)}, within=0.001)
     with pytest.raises(PlanningError, match="none of 128 imagined rollouts"):
         check_rewards(feed(world, imitator(world), far), far, lambda *_: None)
+    never = SuccessCriterion(channel="done")
+    with pytest.raises(PlanningError, match="knows. Give more --steps"):
+        check_rewards(feed(world, imitator(world), never), never, lambda *_: None)
 
 
 def test_a_blind_arm_that_never_reaches_the_goal_stays_as_it_is(tmp_path):

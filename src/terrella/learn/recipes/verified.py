@@ -136,8 +136,8 @@ def check_rewards(feed: VerifiedRollouts, criterion: SuccessCriterion, report: R
     what, name = f"of {reward.numel()} imagined rollouts of the policy", feed.world.spec.name
     if criterion.defined and not reward.any():
         raise PlanningError(
-            f"none {what} in {name} reaches the goal, so there is nothing to reward: is the goal beyond what the world knows? Give "
-            "a larger --within, more --steps, or a policy that sometimes succeeds."
+            f"none {what} in {name} succeeds, so there is nothing to reward: is success beyond what the world knows? Give "
+            f"{'a larger --within, ' * bool(criterion.goal)}more --steps, or a policy that sometimes succeeds."
         )
     raise PlanningError(
         f"the rewards {what} in {name} are all the same within a group: there is nothing to improve there."
