@@ -78,7 +78,7 @@ def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.
     """The same as `_halves` in plain tensor algebra, for GPUs."""
     key = _mixed(seeds + constant(_stream, seeds.device, stream))[:, None]
     mixed = _mixed(key + constant(_steps, seeds.device, count))[None]
-    high, low = (((mixed >> constant(_shifts, seeds.device)) & 0xFFFFFF) * 2.0**-24).unbind(0)
+    high, low = _scaled(mixed, constant(_shifts, seeds.device)).unbind(0)
     return high, low
 
 
@@ -88,7 +88,7 @@ def _layout(streams: tuple[int, ...], counts: tuple[int, ...]) -> torch.Tensor:
     return torch.cat([*(_stream(number)[None] for number in streams), which, *(_steps(count) for count in counts)])
 
 
-def _scaled(mixed: torch.Tensor, shift: int) -> torch.Tensor:
+def _scaled(mixed: torch.Tensor, shift: int | torch.Tensor) -> torch.Tensor:
     return ((mixed >> shift) & 0xFFFFFF) * 2.0**-24
 
 
