@@ -14,7 +14,7 @@ from ..core.spec import EVENT, INSTRUCTION, TEXT
 from .mujoco_tasks import Evaluation, RobotLayout, Spaces, Tensors, numbers
 from .table_hand import SPEED
 from .table_scene import BLOCK_M, COLOURS, CUP_M, DRAWER_M, HANDLE, PLACED, WALL_M
-from .table_teacher import TableState, advice
+from .table_teacher import ABOVE_M, TableState, advice
 from .table_words import TASKS, text_bytes, text_of
 
 BLOCKS = ((-0.14, -0.09), (0.05, 0.07))  # corners of the area where blocks begin, m
@@ -24,7 +24,7 @@ APART_M, LANE_M, AHEAD_M = (
     0.06,
     0.12,
 )  # between blocks; half the width and the length of what is free beside a pushed one
-ABOVE_M, NEAR_M = 0.045, 0.025  # the tip's place above a block that it reaches, and how near it must be
+NEAR_M = 0.025  # how near the tip must be to its place above a block that it reaches
 PUSHED_M, LIFTED_M, OPEN_M, SHUT_M = 0.05, 0.07, 0.08, 0.012
 LET_GO_M = 2 * BLOCK_M + 0.006  # a gap between the fingers at which they hold no block
 _JOBS, _PLACES, _LEFT_OPEN, _WORDS = 21, 22, 23, 24  # streams of random numbers

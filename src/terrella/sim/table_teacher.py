@@ -19,7 +19,7 @@ FUNNEL = 3.0  # height above the goal by the distance to it, while the hand come
 CLOSED_M = 0.003  # by which fingers around something are farther apart than it is wide, when they hold it
 BEHIND_M = 0.05  # of a block that is pushed, of its middle
 CARRY_M = 0.085  # height of the tip over the cup
-ABOVE_M = 0.045
+ABOVE_M = 0.045  # of the tip, of the middle of a block that it reaches
 OPEN, CLOSE = 1.0, -1.0
 
 
