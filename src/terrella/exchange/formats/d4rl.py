@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.errors import DatasetError
 from ...data.source import Source, Take
-from . import arrays, flat, hdf5_file, rows
+from . import arrays, flat, hdf5_file, rows, stacked
 
 
 def read(path: Path, fps: float | None) -> Source:
@@ -19,7 +19,7 @@ def read(path: Path, fps: float | None) -> Source:
     (pictures: observations); metadata/* and the attributes are kept in facts["d4rl"].
     """
     with hdf5_file.open_file(path) as file:
-        episodes = flat.split(_stored(file), str(path))
+        episodes = stacked.split(_stored(file), str(path))
         bare = flat.is_bare(episodes.stored)
         sensors, notes = arrays.columns(episodes.stored, partial(flat.guess, bare), "the array")
         metadata, more = _metadata(file)
@@ -34,7 +34,7 @@ def read(path: Path, fps: float | None) -> Source:
 
     def takes(rate: float) -> Iterator[Take]:
         with hdf5_file.open_file(path) as file:
-            episodes = flat.split(_stored(file), str(path))
+            episodes = stacked.split(_stored(file), str(path))
             for number, span in enumerate(episodes.spans):
                 take = episodes.take(number, sensors, lambda count: np.arange(count) / rate, str(path))
                 yield replace(take, facts={"rows": list(span), **take.facts})

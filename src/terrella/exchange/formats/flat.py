@@ -29,11 +29,11 @@ SPELLINGS = {  # `rollouts.write` uses the first
 }  # fmt: skip
 NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in spellings}
 NEXT = ("next_observations", "next_observation", "next_obs")
-_LAST, _FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
+LAST, FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
 _STEP_TYPE, _LAST_STEP = "step_type", 2  # of dm_env
 # of each episode the row after its last one; its last one, where the very last row is named
 _ENDS = ("episode_ends", "traj_ends", "trajectory_ends", "ep_ends")
-_LENGTHS = ("episode_lengths", "traj_lengths", "trajectory_lengths", "path_lengths", "ep_lengths", "ep_len")
+LENGTHS = ("episode_lengths", "traj_lengths", "trajectory_lengths", "path_lengths", "ep_lengths", "ep_len")
 # of each episode its first row; "episode_starts" may also be a flag for each step
 _STARTS = ("episode_starts", "traj_starts", "trajectory_starts", "path_starts", "ep_offset", "episode_offsets")
 _NUMBERS = (  # of the episode of each row
@@ -99,7 +99,7 @@ def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> 
     "info.NAME", or an observation if `bare` (no array has a name of observations) and its name is not about steps."""
     if place[0] in NAMES:
         return arrays.sensor_at(NAMES, place, shape, dtype)
-    about_steps = place[0] in (*_LAST, *_FIRST, *_NUMBERS, *_COUNTERS, _STEP_TYPE)
+    about_steps = place[0] in (*LAST, *FIRST, *_NUMBERS, *_COUNTERS, _STEP_TYPE)
     observed = (bare and not about_steps) or rows.picture_layout(shape, dtype) is not None
     return rows.sensor_for(rows.OBSERVATION if observed else rows.INFO, arrays.joined(place), shape, dtype)
 
@@ -107,7 +107,7 @@ def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> 
 def is_bare(stored: Mapping[Place, Array]) -> bool:
     """Whether arrays have actions, or bounds of episodes, but no name of observations."""
     heads = {str(place[0]) for place in stored}
-    acted = heads & {*SPELLINGS[rows.ACTION], *_ENDS, *_LENGTHS}
+    acted = heads & {*SPELLINGS[rows.ACTION], *_ENDS, *LENGTHS}
     return bool(acted) and not heads & set(SPELLINGS[rows.OBSERVATION])
 
 
@@ -127,7 +127,7 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
     texts: dict[Place, Array] = {}
     for place, array in stored.items():
         role, rest = NAMES.get(str(place[0])), place[1:]
-        if place[0] in (*_ENDS, *_LENGTHS) or _are_starts(place, array, count):
+        if place[0] in (*_ENDS, *LENGTHS) or _are_starts(place, array, count):
             continue
         kept[place], more[place] = array, (array.shape[0] if array.shape else 0) - count
         if array.dtype.kind in "USO" and len(array.shape) < 2:
@@ -159,7 +159,7 @@ def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> Epi
 
 def _steps(stored: Mapping[Place, Array]) -> int:
     """The number of steps: rows of the actions, else of the flags, else of the first array."""
-    flags = (*SPELLINGS[rows.DONE], *SPELLINGS[rows.TRUNCATED], *_LAST, *_FIRST, *_NUMBERS)
+    flags = (*SPELLINGS[rows.DONE], *SPELLINGS[rows.TRUNCATED], *LAST, *FIRST, *_NUMBERS)
     arrayed = {place: array.shape[0] for place, array in stored.items() if array.shape}
     for heads in (SPELLINGS[rows.ACTION], flags, SPELLINGS[rows.OBSERVATION]):
         for place, count in arrayed.items():
@@ -170,7 +170,7 @@ def _steps(stored: Mapping[Place, Array]) -> int:
 
 def _are_starts(place: Place, array: Array, count: int) -> bool:
     """Whether an array numbers the first rows of episodes."""
-    rowwise = array.shape[:1] == (count,) and place[0] in _FIRST
+    rowwise = array.shape[:1] == (count,) and place[0] in FIRST
     return place[0] in _STARTS and array.dtype.kind in "iu" and len(array.shape) == 1 and not rowwise
 
 
@@ -185,20 +185,20 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
         if flag and math.prod(array.shape[1:]) > 1:
             has = f"{list(array.shape)} numbers, and one for each step is needed"
             raise DatasetError(f"'{head}' in {where} has {has}: store episodes one after another, or a file each.")
-        if starts or head in (*_ENDS, *_LENGTHS):
+        if starts or head in (*_ENDS, *LENGTHS):
             values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
-            stops = np.cumsum(values) if head in _LENGTHS else values + (values.max(initial=0) == count - 1)
+            stops = np.cumsum(values) if head in LENGTHS else values + (values.max(initial=0) == count - 1)
             stops = np.append(values[1:], count) if starts else stops
             if (np.diff(stops, prepend=0) < 1).any() or stops.max(initial=0) > count:
                 raise DatasetError(f"'{head}' in {where} does not fit its {count} rows; mend it, or drop it.")
             ends[stops - 1] = True
         elif rowwise and head in _NUMBERS:
             ends[:-1] |= np.diff(array.read(0, count).reshape(-1)) != 0
-        elif rowwise and head in _FIRST:
+        elif rowwise and head in FIRST:
             ends[:-1] |= array.read(0, count).reshape(-1)[1:].astype(bool)
         elif rowwise and head == _STEP_TYPE:
             flags |= array.read(0, count).reshape(-1) == _LAST_STEP
-        elif rowwise and (flag or head in _LAST):
+        elif rowwise and (flag or head in LAST):
             flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
     if count > 1 and flags[-2:].all() and not flags[-3:-2].any():
         flags[-2] = False  # flagged at the last step and at the terminal observation

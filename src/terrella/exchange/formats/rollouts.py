@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import DatasetError
 from ...core.files import creating
 from ...data.source import Sensor, Source, Take
-from . import arrays, flat, rows
+from . import arrays, flat, rows, stacked
 from .arrays import Array, Place
 
 ABOUT = "terrella.json"  # our description, in the folder of the episodes: names, units and frames
@@ -42,7 +42,7 @@ def read(path: str | Path, fps: float | None = None) -> Source:
     own = {_place(key): described[name] for name, key in _keys(described).items()}
     if len(files) > 1:
         _refuse_single_steps(files[0])
-    every = [flat.split(_columns(file), str(file), bool(about)) for file in files]
+    every = [stacked.split(_columns(file), str(file), bool(about)) for file in files]
     stored = arrays.union(episodes.stored for episodes in every)
     bare = flat.is_bare(stored)
     sensors, notes = arrays.columns(stored, partial(flat.guess, bare), "the key", own)
@@ -136,7 +136,7 @@ def _load(path: Path, key: str) -> np.ndarray:
 def _takes(path: Path, sensors: Mapping[Place, Sensor], fps: float, whole: bool) -> Iterator[Take]:
     """The episodes of a file."""
     stored = _arrays(path)
-    episodes = flat.split({place: it for place, it in stored.items() if not _is_own(place, it)}, str(path), whole)
+    episodes = stacked.split({place: it for place, it in stored.items() if not _is_own(place, it)}, str(path), whole)
     single = {key: _load(path, key) for key in (TASK, START) if (key,) in stored and stored[key,].shape == ()}
     start_ns = int(single[START]) if START in single else None
     for number, (start, stop) in enumerate(episodes.spans):
