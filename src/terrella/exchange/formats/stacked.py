@@ -15,7 +15,7 @@ from .arrays import Array, Place
 _VALID = ("mask", "masks", "valid", "valids", "is_valid", "valid_mask", "attention_mask", "step_mask")
 _PADDING = ("pad", "padding", "is_pad", "padding_mask", "pad_mask")
 _LENGTHS = (*flat.LENGTHS, "lengths", "length", "seq_lengths", "seq_len", "episode_length", "num_steps")
-LENGTHS = (flat.LENGTHS[0],)  # the place where the lengths are told to flat.split
+LENGTHS = (flat.LENGTHS[0],)  # the place where the lengths are handed to flat.split
 
 
 def split(stored: Mapping[Place, Array], where: str, whole: bool = False) -> flat.Episodes:
@@ -93,16 +93,16 @@ def _lengths(stored: Mapping[Place, Array], shape: tuple[int, int], where: str) 
             if (valid[:, 1:] <= valid[:, :-1]).all() and valid[:, 0].all():
                 return valid.sum(1)
     ends = np.zeros(shape, bool)
-    told = [name for name in flags if _role(name) in (rows.DONE, rows.TRUNCATED) or name in flat.LAST]
-    for name in told:
+    marks_ends = [name for name in flags if _role(name) in (rows.DONE, rows.TRUNCATED) or name in flat.LAST]
+    for name in marks_ends:
         ends |= np.nan_to_num(flags[name].read(0, episodes).reshape(shape)).astype(bool)
-    if not told:
+    if not marks_ends:
         return np.full(episodes, steps) if set(flags) & set(flat.FIRST) else None
     lengths = np.where(ends.any(1), ends.argmax(1) + 1, steps)
     if not _ends_once(stored, ends, lengths):
         has = f"[{episodes}, {steps}, ...] numbers, and one for each step is needed"
         raise DatasetError(
-            f"'{told[0]}' in {where} has {has}: store episodes one after another, or add the array '{LENGTHS[0]}' with the "
+            f"'{marks_ends[0]}' in {where} has {has}: store episodes one after another, or add the array '{LENGTHS[0]}' with the "
             "steps of each."
         )
     return lengths
