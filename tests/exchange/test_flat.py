@@ -73,7 +73,8 @@ def test_terminal_observations_are_the_episodes_own(tmp_path):
     saved(tmp_path / "end.npz", {"obs": np.arange(ROWS + 1.0), "acts": ACTION, "dones": LAST})
     seen = {
         name: [
-            take.readings["observation.state"].values.ravel().tolist() for take in open_source(tmp_path / name).takes()
+            np.ravel(np.asarray(take.readings["observation.state"].values)).tolist()
+            for take in open_source(tmp_path / name).takes()
         ]
         for name in ("next.npz", "more.npz", "end.npz")
     }
@@ -93,8 +94,8 @@ def test_records_of_several_fields_and_files_without_observations_are_read(tmp_p
     fields["position"], fields["grip"] = np.arange(ROWS)[:, None], 7
     saved(tmp_path / "a.npz", {"observations": fields, "actions": ACTION, "terminals": LAST})
     (first, *_) = open_source(tmp_path / "a.npz").takes()
-    np.testing.assert_array_equal(first.readings["observation.position"].values[:, 2], np.arange(5))
-    assert first.readings["observation.grip"].values.tolist() == [[7]] * 5
+    np.testing.assert_array_equal(np.asarray(first.readings["observation.position"].values)[:, 2], np.arange(5))
+    assert np.asarray(first.readings["observation.grip"].values).tolist() == [[7]] * 5
     more = {"data/is_last": LAST, "data/discount": np.ones(ROWS), "meta/episode_ends": np.array([5, 9, 12])}
     saved(tmp_path / "b.npz", {"data/action": ACTION, "data/state": STATE, **more})
     source = open_source(tmp_path / "b.npz")
