@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from typing import Any
 
 import pytest
 import torch
@@ -35,7 +36,7 @@ def flow(moves: int) -> LearnedWorld:
 def latent(pictures: bool) -> LatentWorld:
     """A latent world of pictures, or an arm whose latent is its joints."""
     controls = Controls(AXES, (-1.0,) * 2, (1.0,) * 2)
-    shape = (
+    shape: dict[str, Any] = (
         {"size": (64, 64)} if pictures else {"vectors": (("joints", 4), ("speed", 4)), "identity": True, "latent": 8}
     )
     network = LatentNetwork(LatentConfig(2, **shape))
@@ -43,11 +44,11 @@ def latent(pictures: bool) -> LatentWorld:
 
 
 WORLDS = {
-    "doom-maze": (lambda: terrella.load("doom-maze"), 1060),
-    "doom-corridor": (lambda: terrella.load("doom-corridor"), 1490),
-    "flow": (lambda: flow(0), 300),
-    "flow that scrolls": (lambda: flow(15), 425),
-    "islet": (lambda: terrella.load("islet"), 560),
+    "doom-maze": (lambda: terrella.load("doom-maze"), 1037),
+    "doom-corridor": (lambda: terrella.load("doom-corridor"), 1458),
+    "flow": (lambda: flow(0), 290),
+    "flow that scrolls": (lambda: flow(15), 390),
+    "islet": (lambda: terrella.load("islet"), 500),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }

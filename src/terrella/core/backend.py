@@ -1,11 +1,12 @@
 """Which of two ways computes: kernels of numba on a CPU, or programs of tensors, which run on every device and can be compiled."""
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, MutableMapping
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
 import torch
+from torch.utils.weak import WeakTensorKeyDictionary
 
 _tensors_alone = False
 
@@ -41,6 +42,22 @@ def _made(make: Callable[..., torch.Tensor], device: torch.device, types: Hashab
 def _types(given: tuple[Hashable, ...]) -> Hashable:
     """The types of numbers, also in tuples: (1,) and (1.0,) are equal, and make tensors of other types."""
     return tuple(_types(one) if isinstance(one, tuple) else type(one) for one in given)
+
+
+def derived(make: Callable[..., torch.Tensor], source: torch.Tensor, *given: Hashable) -> torch.Tensor:
+    """`make(source, *given)`, made once for a tensor and again after it was written to. Nobody may write to it."""
+    if source.is_inference():  # nobody counts what is written to it
+        return make(source, *given)
+    held = _derived.setdefault(source, {})
+    version, made = held.get((make, given), (None, None))
+    if made is None or version != source._version:
+        with torch.inference_mode(False), torch.no_grad():
+            made = make(source, *given)
+        held[make, given] = source._version, made
+    return made
+
+
+_derived: MutableMapping[torch.Tensor, dict] = WeakTensorKeyDictionary()
 
 
 def table(*rows: Any) -> torch.Tensor:

@@ -49,7 +49,7 @@ def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> t
     count = math.prod(shape)
     high, low = _halves(seeds, (count + 1) // 2, stream)
     radius, angle = high.add_(2.0**-25).log_().mul_(-2).sqrt_(), low.mul_(2 * math.pi)
-    both = torch.stack([angle.cos(), angle.sin_()], 1).mul_(radius[:, None])
+    both = torch.view_as_real(torch.polar(radius, angle)).mT
     return both.flatten(1)[:, :count].reshape(len(seeds), *shape)
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from ..core.backend import constant, kernels_do
+from ..core.backend import constant, derived, kernels_do
 from .kernels_numba.matching import edge_shares as edge_shares_kernel
 from .mosaic import displaced
 from .views import arrays, each_view
@@ -27,12 +27,9 @@ def edge_shares_slowly(before: torch.Tensor, after: torch.Tensor, moves: torch.T
     corners = constant(_corners, after.device, *size)
     now = after.flatten(-2)[..., corners].int()  # [..., 3, corner, n]
     edges = (now[..., 1:, :] - now[..., :1, :]).abs().amax((-3, -2)) > TEXTURED
-    place, rows, columns = displaced(moves, size, size)
-    was = before.flatten(-2)[..., place.flatten(1)[:, corners]]  # [..., 3, M, corner, n]
+    was = before.flatten(-2)[..., derived(_came_from, moves, *size)]  # [..., 3, M, corner, n]
     off = (was - now[..., None, :, :]).abs().amax((-4, -2))
-    rows, columns = (part[:, 1::2] & part[:, :-1:2] for part in (rows, columns))
-    inside = (rows[..., None] & columns[:, None]).flatten(1)
-    same = (off <= SAME) & inside & edges[..., None, :]
+    same = (off <= SAME) & derived(_comes_from_inside, moves, *size) & edges[..., None, :]
     return same.sum(-1) / edges.sum(-1, keepdim=True).clamp_min(1)
 
 
@@ -40,6 +37,18 @@ def _corners(height: int, width: int) -> torch.Tensor:
     """int64 [3, n]: every second pixel, those above, and those to the left."""
     pixels = torch.arange(1, height, 2)[:, None] * width + torch.arange(1, width, 2)
     return torch.stack([pixels.flatten() - step for step in (0, width, 1)])
+
+
+def _came_from(moves: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """int64 [M, 3, n]: the pixels that each move brings to `_corners`, or the nearest."""
+    place = displaced(moves, (height, width), (height, width))[0]
+    return place.flatten(1)[:, _corners(height, width).to(moves.device)]
+
+
+def _comes_from_inside(moves: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """bool [M, n]: whether these lie in the picture."""
+    rows, columns = (part[:, 1::2] & part[:, :-1:2] for part in displaced(moves, (height, width), (height, width))[1:])
+    return (rows[..., None] & columns[:, None]).flatten(1)
 
 
 def scroll_index(before: torch.Tensor, after: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:

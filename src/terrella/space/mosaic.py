@@ -37,13 +37,11 @@ def update_mosaic_slowly(
     after = _window(mosaic, move, mosaic.shape[-2:])
     top, left = middle(mosaic, size)
     seen = after[..., top : top + size[0], left : left + size[1]]
-    whole = seen.int()
-    votes = whole[:, 3:]
-    same = (whole[:, :3] - frame).abs().amax(1, keepdim=True) <= SAME
-    agree = same & (votes > 0)
-    colour = torch.where(agree | (votes > 1), whole[:, :3], frame)
-    votes = torch.where(agree, (votes + 1).clamp_max(MOST), (votes - 1).clamp_min(1))  # outvoted, or of a new colour
-    after[..., top : top + size[0], left : left + size[1]] = torch.where(over, whole, torch.cat([colour, votes], 1))
+    colours, votes = seen.split([3, 1], 1)
+    same = (colours.int() - frame).abs().amax(1, keepdim=True) <= SAME
+    colour = torch.where(votes + same > 1, colours, frame)  # else outvoted, or new
+    votes = torch.add(votes, same, alpha=2).clamp_(2, MOST + 1).sub_(1)
+    after[..., top : top + size[0], left : left + size[1]] = torch.where(over, seen, torch.cat([colour, votes], 1))
     return after
 
 

@@ -72,7 +72,7 @@ class Controls:
             which, options = (
                 constant(make, action.device, self.low, tuple(self.counts)) for make in (_which, _options)
             )
-            return (picked[:, which] == options).float()
+            return ((picked if len(self.counts) == 1 else picked[:, which]) == options).float()
         if self.kind == AXES:
             low, high = (constant(torch.tensor, action.device, limit) for limit in (self.low, self.high))
             return (2 * (given - low) / (high - low).clamp_min(1e-6) - 1).clamp(-1, 1)

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..core.backend import constant
+from ..core.backend import constant, plus
 from ..space.mosaic import displaced, read_mosaic
 from ..space.overlap import Blend, MountedCamera
 from .generator import Conditioning, encode_depth, parts_of
@@ -79,7 +79,10 @@ class AdaptiveBlock(nn.Module):
 
 def modulations(blocks: Sequence[AdaptiveBlock], embedding: torch.Tensor) -> list[Modulation]:
     """Of each block by an embedding [B, WIDE]."""
-    halves = [block.embedding(embedding)[..., None, None].chunk(2, -3) for block in blocks]
+    weight, bias = (torch.cat([getattr(block.embedding, name) for block in blocks]) for name in ("weight", "bias"))
+    widths = [len(block.embedding.bias) for block in blocks]
+    parts = F.linear(embedding, weight, bias)[..., None, None].split(widths, -3)
+    halves = [part.chunk(2, -3) for part in parts]
     scales = torch._foreach_add([scale for scale, _ in halves], 1.0)
     return [(scale, shift) for scale, (_, shift) in zip(scales, halves)]
 
@@ -134,12 +137,18 @@ class FlowNetwork(nn.Module):
         middle = second.modulated(self.down[0](fine), by[1])
         coarse = third.modulated(self.down[1](middle), by[2])
         tokens = coarse.flatten(2).transpose(1, 2)
-        attended = self.attention(tokens, tokens, tokens, need_weights=False)[0]
-        coarse = coarse + attended.transpose(1, 2).unflatten(2, coarse.shape[-2:])
+        coarse = coarse + self._attended(tokens).transpose(1, 2).unflatten(2, coarse.shape[-2:])
         base = frames[:, 0] if scroll is None else carry(frames[:, 0], scroll, self.moves, self.over, memory)
         remembered = self._remembered(memory, base) if self.config.moves else None
         older = frames[:, min(1, frames.shape[1] - 1)]
         return FlowFeatures((fine, middle, coarse), embedding, base, older, remembered)
+
+    def _attended(self, tokens: torch.Tensor) -> torch.Tensor:
+        """Self-attention of tokens [B, n, C]."""
+        projected = F.linear(tokens, self.attention.in_proj_weight, self.attention.in_proj_bias)
+        query, key, value = projected.unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        heads = F.scaled_dot_product_attention(query, key, value)
+        return self.attention.out_proj(heads.transpose(1, 2).flatten(2))
 
     def clean(self, seen: FlowFeatures, noisy: torch.Tensor, time: torch.Tensor) -> torch.Tensor:
         """The clean frame [B, 3, H, W] in -1..1 by `noisy` of the same shape at flow time [B]."""
@@ -171,7 +180,7 @@ class FlowNetwork(nn.Module):
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]).masked_fill(self.over, 0)
-        rgb = torch.add(constant(torch.tensor, noise.device, -1.0), conditioning.glimpse.rgb, alpha=2)
+        rgb = plus(-1.0, conditioning.glimpse.rgb, 2)
         x = self.sample(rgb, conditioning.context, scroll, memory, noise[:, :3], steps)
         return torch.cat([x, constant(_no_depth, x.device, *self.config.size).expand(len(x), -1, -1, -1)], 1)
 
@@ -188,7 +197,7 @@ class FlowNetwork(nn.Module):
             x = agreed(self._cleaned(seen, noisy, [(scale[:, step], shift[:, step]) for scale, shift in whole]))
         x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
         if memory is not None:
-            known = memory[:, :3] / 127.5 - 1
+            known = plus(-1.0, memory[:, :3], 1 / 127.5)
             x = torch.where(_alike(x, known, RECALLED) & (memory[:, 3:] > 0), known, x)
         return x
 
@@ -211,7 +220,7 @@ class FlowNetwork(nn.Module):
         if memory is None:
             return base.new_zeros(len(base), 4, *base.shape[-2:])
         known = (memory[:, 3:] > 0).float()
-        return torch.cat([(memory[:, :3] / 127.5 - 1 - base) * known, known], 1)
+        return torch.cat([(plus(-1.0, memory[:, :3], 1 / 127.5) - base) * known, known], 1)
 
     def _padded(self, maps: torch.Tensor) -> torch.Tensor:
         """Maps [B, C, H, W] with replicated edges where a side is no multiple of 16."""
@@ -252,10 +261,10 @@ def carry(
     carried = torch.where(over, last, carried)
     if memory is None:
         return carried
-    new = ~(rows[..., None] & columns[:, None]) | over.flatten()[place]
-    return torch.where((new > over)[:, None] & (memory[:, 3:] > 0), memory[:, :3] / 127.5 - 1, carried)
+    new = over.flatten()[place] >= (rows[..., None] & columns[:, None])
+    return torch.where((new > over)[:, None] & (memory[:, 3:] > 0), plus(-1.0, memory[:, :3], 1 / 127.5), carried)
 
 
 def _alike(one: torch.Tensor, other: torch.Tensor, most: float) -> torch.Tensor:
     """bool [B, 1, H, W]: where colours [B, 3, H, W] differ by less than `most`."""
-    return (one - other).abs().amax(1, keepdim=True) < most
+    return torch.linalg.vector_norm(one - other, torch.inf, dim=1, keepdim=True) < most

@@ -194,12 +194,12 @@ def decode_depth(code: torch.Tensor) -> torch.Tensor:
 def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:
     """Frames uint8 [B, 3, H, W] as tiny pictures in [-1, 1]: [B, 36]. Where nothing is known of a view, the last frame is the
     best hint of how the place looks."""
-    return F.adaptive_avg_pool2d(rgb / 127.5 - 1, THUMBNAIL).flatten(1)
+    return F.adaptive_avg_pool2d(plus(-1.0, rgb, 1 / 127.5), THUMBNAIL).flatten(1)
 
 
 def pixels(clean: torch.Tensor) -> torch.Tensor:
     """The colours of a drawn frame [B, 4 or more, H, W] as uint8 [B, 3, H, W]."""
-    return ((clean[:, :3] + 1) * 127.5).round().clamp(0, 255).to(torch.uint8)
+    return plus(128.0, clean[:, :3], 127.5).clamp(0, 255).to(torch.uint8)
 
 
 def decode(clean: torch.Tensor, posed: bool) -> DrawnFrame:

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from torch import nn
 
 from ..core import chance
-from ..core.backend import constant
+from ..core.backend import constant, plus
 from ..core.errors import ObservationError
 from ..core.spec import DONE, REWARD
 from ..core.state import State
@@ -218,5 +218,5 @@ def _shrunk(frame: torch.Tensor, side: int) -> torch.Tensor:
     height, width = frame.shape[-2:]
     share = min(1.0, side / max(height, width))
     size = [max(8, 2 * round(length * share / 2)) for length in (height, width)]
-    picture = frame / 127.5 - 1
+    picture = plus(-1.0, frame, 1 / 127.5)
     return picture if size == [height, width] else F.interpolate(picture, size, mode="area")

@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ..core.backend import derived, plus
 from ..space.matching import edge_shares
 from .generator import Conditioning
 
@@ -26,7 +27,7 @@ class Scroll(nn.Module):
 
     def frame_features(self, frame: torch.Tensor) -> torch.Tensor:
         """Features [B, 64] of the newest frame uint8 [B, 3, H, W]."""
-        return self.glance(frame / 127.5 - 1)
+        return self.glance(plus(-1.0, frame, 1 / 127.5))
 
     def forward(self, seen: torch.Tensor, context: torch.Tensor, went: torch.Tensor) -> torch.Tensor:
         """Logits [B, moves + 1]. seen: of `frame_features`; went [B, slots - 1, moves + 1]: how well each move explained each
@@ -37,7 +38,7 @@ class Scroll(nn.Module):
 
 def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Tensor) -> torch.Tensor:
     """By which of the `moves` int64 [K, 2] most of the picture goes on: int64 [B]."""
-    frames = (conditioning.glimpse.rgb * 255).round().to(torch.uint8)  # the newest first
+    frames = plus(0.5, conditioning.glimpse.rgb, 255).to(torch.uint8)  # the newest first
     went = edge_shares(frames[:, 1:], frames[:, :-1], moves)
     logits = scroll(scroll.frame_features(frames[:, 0]), conditioning.context, went)
     return least_off(logits, moves)
@@ -46,5 +47,9 @@ def predicted_scroll(scroll: Scroll, conditioning: Conditioning, moves: torch.Te
 def least_off(logits: torch.Tensor, moves: torch.Tensor) -> torch.Tensor:
     """The move int64 [B], of `moves` [K, 2] with logits [B, K], with the least expected error in pixels: where several are likely
     one in the middle, since a picture that is off stays off."""
-    off = torch.cdist(*[moves.float()] * 2, p=1)
-    return (logits.softmax(1) @ off).argmin(1)
+    return (logits.softmax(1) @ derived(_apart, moves)).argmin(1)
+
+
+def _apart(moves: torch.Tensor) -> torch.Tensor:
+    """float32 [K, K]: pixels between moves int64 [K, 2]."""
+    return torch.cdist(*[moves.float()] * 2, p=1)

@@ -104,19 +104,22 @@ class UncertaintyNetwork(nn.Module):
         cells = self(input_maps(conditioning, clean), situation_of(placed(gone), conditioning))
         invented = torch.maximum(self.calibrated(cells.mean((1, 2))), self.invents * gone[:, 4])
         invented = torch.minimum(invented, self.ceiling)
-        drifted = (self.ceiling - invented) * self.drifts(gone)
-        return Expected(invented + drifted, drifted, invented)
+        both = torch.lerp(self.ceiling, invented, self._stays(gone))
+        return Expected(both, both - invented, invented)
 
     def drifts(self, gone: torch.Tensor) -> torch.Tensor:
         """How much of the way to the ceiling the error of a frame is [B], by its steps, metres and radians since evidence."""
-        return 1 - torch.exp(-((gone[:, :3] @ self.drift[:3]).clamp_min(1e-9) ** self.drift[3]))
+        return 1 - self._stays(gone)
+
+    def _stays(self, gone: torch.Tensor) -> torch.Tensor:
+        return torch.exp(-((gone[:, :3] @ self.drift[:3]).clamp_min(1e-9) ** self.drift[3]))
 
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
         """Linear between the knots; in proportion beyond them, up to the ceiling."""
         answers, errors = self.answers, self.errors
         within = answer.clamp(answers[0], answers[-1])
-        at = torch.searchsorted(answers, within).clamp(1, KNOTS - 1)  # nan comes after all
-        knots = torch.stack([answers, errors], 1).unfold(0, 2, 1)[at - 1]  # [..., answers or errors, below or above]
+        below = torch.searchsorted(answers[1:-1], within)  # nan comes after all
+        knots = torch.stack([answers, errors], 1).unfold(0, 2, 1)[below]  # [..., answers or errors, below or above]
         low, high = knots.unbind(-1)
         share = (within - low[..., 0]) / (high - low)[..., 0].clamp_min(1e-6)
         inside = torch.lerp(low[..., 1], high[..., 1], share)
@@ -177,10 +180,20 @@ def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     drawn, merged = clean[:, :3].clamp(-1, 1), plus(-1.0, merge(glimpse), 2)
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)
     second = glimpse.rgb[:, min(1, glimpse.rgb.shape[1] - 1)]
-    apart = ((glimpse.rgb[:, 0] - second).abs().mean(1, keepdim=True)) * (trust[:, 1:] > 0)
-    edges = F.pad(drawn.diff(dim=3).abs().mean(1, keepdim=True), (0, 1))
-    own = ((drawn - merged).abs() * glimpse.known[:, None]).mean(1, keepdim=True)
+    apart = _sizes(glimpse.rgb[:, 0] - second) * (trust[:, 1:] > 0)
+    edges = F.pad(_sizes(drawn.diff(dim=3)), (0, 1))
+    own = _sizes(drawn - merged) * glimpse.known[:, None]
     maps = [drawn, merged, own, glimpse.known[:, None], trust, last[:, 3:4], apart, clean[:, 3:4], edges]
     soft = F.avg_pool2d(torch.cat(maps, 1), CELLS)
     here = soft[:, :3] - F.avg_pool2d(F.pad(soft[:, :3], (1, 1, 1, 1), mode="replicate"), 3, 1)
-    return torch.cat([soft, here.abs().mean(1, keepdim=True)], 1)
+    mean = constant(_mean_of_colours, soft.device)  # of the maps of `_sizes`, which are sums
+    return torch.cat([soft, _sizes(here)], 1) * mean
+
+
+def _sizes(colours: torch.Tensor) -> torch.Tensor:
+    """The sum of the absolute values of colours [B, 3, H, W]: [B, 1, H, W]."""
+    return torch.linalg.vector_norm(colours, 1, dim=1, keepdim=True)
+
+
+def _mean_of_colours() -> torch.Tensor:
+    return torch.tensor([1 / 3 if row in (6, 11, 13, 14) else 1.0 for row in range(INPUT_MAPS)])[:, None, None]
