@@ -153,9 +153,11 @@ class Guarded:
         if self.simulator is not None:
             by_simulator = wrong if self.config.disagreement is None else self._disagrees(bare, action) & ~_done(bare)
             motion = self._simulated(state, motion, action, by_simulator)
+        if motion is not predicted:
+            ratios = self._ratios(motion, fresh)
         if self.config.project:
-            motion = self._projected(motion, fresh, ~_done(bare) & ~by_simulator)
-        left = self._ratios(motion, fresh) > 1
+            motion, ratios = self._projected(motion, ratios, fresh, ~_done(bare) & ~by_simulator)
+        left = ratios > 1
         flat = channels_of(motion)
         changed = torch.stack([(flat[name] != predicted.channels[name][-1]).any(1) for name in flat]).any(0)
         if changed.any():
@@ -220,16 +222,22 @@ class Guarded:
             return motion.position.new_zeros(motion.batch, 0)
         return torch.stack([_ratio(one, motion, fresh) for one in self.tolerances], 1)
 
-    def _projected(self, motion: Trajectory, fresh: Tensor, allowed: Tensor) -> Trajectory:
-        """Each broken law's projection in turn, on the rollouts that break it."""
+    def _projected(
+        self, motion: Trajectory, ratios: Tensor, fresh: Tensor, allowed: Tensor
+    ) -> tuple[Trajectory, Tensor]:
+        """(motion, ratios) after the projections of the laws that each rollout breaks, in turn. A round works on the rollouts that
+        still break a law, and judges them at its end."""
         for _ in range(ROUNDS):
-            if not ((self._ratios(motion, fresh) > 1).any(1) & allowed).any():
+            rows = ((ratios > 1).any(1) & allowed).nonzero()[:, 0]
+            if not len(rows):
                 break
-            for one in self.tolerances:
-                rows = (_ratio(one, motion, fresh) > 1) & allowed
-                if rows.any():
-                    motion = _mixed(motion, one.law.correct(motion), rows)
-        return motion
+            part, wrong = motion.at(rows), ratios[rows] > 1
+            for one, broken in zip(self.tolerances, wrong.T):
+                if broken.any():
+                    part = _mixed(part, one.law.correct(part), broken)
+            motion = motion.put(rows, part)
+            ratios = ratios.index_copy(0, rows, self._ratios(part, fresh[rows]))
+        return motion, ratios
 
     def _simulated(self, state: State, motion: Trajectory, action: Tensor, rows: Tensor) -> Trajectory:
         assert self.simulator is not None

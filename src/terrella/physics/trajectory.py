@@ -150,6 +150,14 @@ class Trajectory:
         parts = {name: getattr(self, name)[:, rows] for name in _PARTS}
         return replace(self, **parts, channels={name: part[:, rows] for name, part in self.channels.items()})
 
+    def put(self, rows: Tensor, part: Trajectory) -> Trajectory:
+        """The same with `part` in place of the rollouts `rows` (int64)."""
+        if len(rows) == self.batch:
+            return part
+        parts = {name: getattr(self, name).index_copy(1, rows, getattr(part, name)) for name in _PARTS}
+        channels = {name: own.index_copy(1, rows, part.channels[name]) for name, own in self.channels.items()}
+        return replace(self, **parts, channels=channels)
+
     def instants(self, instants: Tensor) -> Trajectory:
         """One instant of each rollout (int64 [B]) alone."""
         rows = torch.arange(self.batch)
