@@ -158,8 +158,11 @@ class Guarded:
         if self.config.project:
             motion, ratios = self._projected(motion, ratios, fresh, ~_done(bare) & ~by_simulator)
         left = ratios > 1
-        flat = channels_of(motion)
-        changed = torch.stack([(flat[name] != predicted.channels[name][-1]).any(1) for name in flat]).any(0)
+        changed = _changed(predicted, motion)
+        flat = {
+            name: torch.where(changed[:, None], part, predicted.channels[name][-1])
+            for name, part in channels_of(motion).items()
+        }
         if changed.any():
             proposal = self._written(proposal, flat, changed, rng)
         way = torch.stack([_way(predicted), _way(motion)], 1)
@@ -366,6 +369,18 @@ def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
 def _way(motion: Trajectory) -> Tensor:
     """The way of all bodies in the last step [B], m."""
     return (motion.position[-1] - motion.position[-2]).norm(dim=-1).sum(-1)
+
+
+def _changed(before: Trajectory, after: Trajectory) -> Tensor:
+    """bool [B]: the rollouts whose last instant differs."""
+    if before is after:
+        return torch.zeros(before.batch, dtype=torch.bool)
+    parts = [
+        (getattr(before, name), getattr(after, name))
+        for name in ("position", "velocity", "rotation", "spin", "present")
+    ]
+    parts += [(part, after.channels[name]) for name, part in before.channels.items()]
+    return torch.stack([(one[-1] != other[-1]).flatten(1).any(1) for one, other in parts]).any(0)
 
 
 def _mixed(motion: Trajectory, other: Trajectory, rows: Tensor) -> Trajectory:

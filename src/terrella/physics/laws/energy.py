@@ -80,13 +80,23 @@ class Energy:
         return replace(motion, velocity=velocity), some
 
     def correct(self, motion: Trajectory) -> Trajectory:
-        """Scales the speeds, so that the energy is that before the step; where heights alone exceed it, bodies stop."""
-        whole, free = energy(motion), (~motion.driven)[None, :, None]
-        kinetic = (0.5 * motion.mass[-1] * motion.velocity[-1].square().sum(-1) * ~motion.driven).sum(-1)
+        """Scales the speeds, so that the energy is that before the step; what heights alone exceed it by, bodies sink back."""
+        whole, free = energy(motion), ~motion.driven[None, :]
+        moving = (motion.present[-1] & free).double()
+        turning = 0.5 * (motion.inertia[-1] * motion.spin[-1].square()).sum(-1)
+        kinetic = ((0.5 * motion.mass[-1] * motion.velocity[-1].square().sum(-1) + turning) * moving).sum(-1)
         excess = whole[-1] - (whole[:-1].amin(0) if motion.system.dissipates else whole[-2])
-        wrong = (excess > 0) | (not motion.system.dissipates)
+        wrong = ((excess > 0) | (not motion.system.dissipates)) & motion.left_alone[-1]
         factor = ((kinetic - excess).clamp_min(0) / kinetic.clamp_min(1e-12)).sqrt()
-        factor = torch.where(wrong & motion.left_alone[-1] & (kinetic > 1e-9), factor, 1.0)
+        factor = torch.where(wrong[:, None] & free, torch.where(kinetic > 1e-9, factor, 1.0)[:, None], 1.0)[..., None]
+        rise = (motion.position[-2] - motion.position[-1]) @ motion.gravity
+        rise = rise.clamp_min(0) * motion.mass[-1] * moving * ~motion.tied
+        share = torch.where(wrong, (excess - kinetic).clamp_min(0) / rise.sum(-1).clamp_min(1e-12), 0.0).clamp_max(1)
+        down = motion.gravity / motion.gravity.square().sum().clamp_min(1e-12)
+        sunk = (share[:, None] * rise / motion.mass[-1].clamp_min(1e-12))[..., None] * down
         return with_last(
-            motion, velocity=torch.where(free, motion.velocity[-1] * factor[:, None, None], motion.velocity[-1])
+            motion,
+            position=motion.position[-1] + sunk,
+            velocity=motion.velocity[-1] * factor,
+            spin=motion.spin[-1] * factor,
         )
