@@ -8,7 +8,8 @@ import torch
 from terrella.core import State, check_world, make_rng, rollout
 from terrella.core.errors import TerrellaError
 from terrella.physics import PhysicalSystem, calibrate, trajectory_of
-from terrella.physics.guarded import GuardConfig, Guarded, replay_case
+from terrella.physics.guarded import GuardConfig, Guarded, changed_rollouts, replay_case
+from terrella.physics.system import RigidBody, Slot, Wall
 from terrella.sim.bodies import BodiesConfig, BodiesWorld
 
 STEPS = 24
@@ -53,11 +54,13 @@ def predicted(world, seen, batch: int, system):
     return done.final, trajectory_of(system, done.observations, world.spec.dt_s)
 
 
-@pytest.mark.parametrize("family", ["parabola", "bouncing"])
-def test_a_guard_removes_most_violations_and_most_of_the_error(family):
+@pytest.mark.parametrize(
+    ("family", "noise"), [("parabola", 0.0), ("bouncing", 0.0), ("pendulum", 0.0), ("collision", 0.02)]
+)
+def test_a_guard_removes_most_violations_and_most_of_the_error(family, noise):
     system, _, known = truth(family, 1, 120)
     _, seen, true = truth(family, 2, 20)
-    tolerances, bare = calibrate(known), Biased(family)
+    tolerances, bare = calibrate(known), Biased(family, noise)
     guarded = Guarded(bare, system, tolerances)
     (final, mine), (_, plain) = predicted(guarded, seen, 20, system), predicted(bare, seen, 20, system)
     report = guarded.report(final)
@@ -93,6 +96,32 @@ def test_the_truth_is_left_as_it_is():
     final, mine = predicted(guarded, seen, 10, system)
     assert guarded.report(final).corrected == 0
     assert torch.allclose(mine.position, true.position, atol=1e-5)
+
+
+def test_what_was_observed_beyond_the_range_of_a_world_is_held_as_observed():
+    class Clipping(Biased):
+        """A world that knows places within 0.3 m alone."""
+
+        def observe(self, observation, prior, rng):
+            near = {**observation, "position": observation["position"].clamp(-0.3, 0.3)}
+            return super().observe(near, prior, rng)
+
+    system, _, known = truth("parabola", 1, 120)
+    _, seen, true = truth("parabola", 2, 10)
+    guarded = Guarded(Clipping("parabola"), system, calibrate(known))
+    final, mine = predicted(guarded, seen, 10, system)
+    assert torch.allclose(mine.position, true.position, atol=1e-3)
+    assert not guarded.report(final).frozen, "the jump from what was clipped is no motion"
+
+
+def test_only_what_was_changed_counts_as_corrected():
+    """A world may predict quaternions whose length is not quite 1."""
+    ball = RigidBody("ball", Slot("pose"), Slot("speed"), rotation=Slot("pose", 3), radius_m=0.1)
+    system = PhysicalSystem((ball,), (Wall((0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)),))
+    rows = {"pose": torch.tensor([0.0, 0, 5, 1.01, 0, 0, 0]).repeat(3, 1, 1), "speed": torch.zeros(3, 1, 3)}
+    motion = trajectory_of(system, rows, 0.02)
+    assert not changed_rollouts(motion, trajectory_of(system, rows, 0.02)).any()
+    assert changed_rollouts(motion, replace(motion, position=motion.position + 1e-3)).all()
 
 
 def test_a_guarded_world_keeps_the_contract():

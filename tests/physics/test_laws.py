@@ -230,3 +230,27 @@ def test_energy_is_constant_where_only_positions_are_known(family, most):
 def test_positions_alone_give_the_speed_of_flight():
     motion = truth("parabola", 2, 100)
     assert torch.allclose(without_velocities(motion).velocity, motion.velocity, atol=1e-4)
+
+
+def test_energy_is_taken_from_a_rise_without_speed():
+    """A ball that creeps upwards on the floor, as weak worlds have it, sinks back; its mates do not move."""
+    bodies = tuple(
+        RigidBody(name, Slot("place", 3 * at), Slot("speed", 3 * at), radius_m=0.1) for at, name in enumerate("ab")
+    )
+    place = torch.tensor([0.0, 0, 0.1, 5, 0, 0.1]).repeat(3, 1, 1)
+    place[2, 0, 2] += 0.01
+    motion = trajectory_of(PhysicalSystem(bodies, (FLOOR,)), {"place": place, "speed": torch.zeros(3, 1, 6)}, 0.02)
+    law = next(one for one in LAWS if one.name == "energy")
+    assert float(law.residual(motion)[-1]) > 0.01
+    mended = law.correct(motion)
+    assert float(law.residual(mended)[-1]) < 1e-6
+    assert torch.allclose(mended.position[-1], motion.position[-2], atol=1e-6)
+
+
+def test_turning_is_energy_too():
+    ball = RigidBody("a", Slot("place"), Slot("speed"), spin=Slot("spin"), radius_m=0.1)
+    rows = {"place": torch.zeros(3, 1, 3) + 5, "speed": torch.zeros(3, 1, 3), "spin": torch.ones(3, 1, 3)}
+    rows["spin"][2] = 3.0
+    motion = trajectory_of(PhysicalSystem((ball,), gravity_m_s2=(0.0, 0.0, 0.0)), rows, 0.02)
+    law = next(one for one in LAWS if one.name == "energy")
+    assert torch.allclose(law.correct(motion).spin[-1], motion.spin[-2], atol=1e-6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -135,7 +136,7 @@ class Guarded:
 
     def observe(self, observation: Observation, prior: State | None, rng: torch.Generator) -> State:
         bare = None if prior is None else _bare(prior)
-        return self._begun(self.world.observe(observation, bare, rng), prior)
+        return self._begun(self.world.observe(observation, bare, rng), prior, observation)
 
     def imagine(self, state: State, action: Tensor, rng: torch.Generator) -> State:
         bare, seeds = _bare(state), chance.seeds(state.batch, rng)
@@ -158,7 +159,7 @@ class Guarded:
         if self.config.project:
             motion, ratios = self._projected(motion, ratios, fresh, ~_done(bare) & ~by_simulator)
         left = ratios > 1
-        changed = _changed(predicted, motion)
+        changed = changed_rollouts(predicted, motion)
         flat = {
             name: torch.where(changed[:, None], part, predicted.channels[name][-1])
             for name, part in channels_of(motion).items()
@@ -198,8 +199,11 @@ class Guarded:
 
     # -- inside -------------------------------------------------------------------------------------------------------
 
-    def _begun(self, inner: State, prior: State | None) -> State:
+    def _begun(self, inner: State, prior: State | None, observation: Observation = MappingProxyType({})) -> State:
+        """What was observed is held as it was observed: a world may clip what lies beyond its training."""
         seen, batch = self._seen(inner), inner.batch
+        given = {name: torch.as_tensor(observation[name]) for name in seen if name in observation}
+        seen |= {name: part.cpu().double().reshape(batch, -1) for name, part in given.items()}
         before = {name: part if prior is None else prior[_GUARD + name][:, -1] for name, part in seen.items()}
         held = {_GUARD + name: torch.stack([before[name], part], 1) for name, part in seen.items()}
         laws = len(self.tolerances)
@@ -367,11 +371,12 @@ def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
 
 
 def _way(motion: Trajectory) -> Tensor:
-    """The way of all bodies in the last step [B], m."""
-    return (motion.position[-1] - motion.position[-2]).norm(dim=-1).sum(-1)
+    """The way of all bodies in the last step [B], m; a jump counts as far as the larger speed reaches."""
+    reach = motion.velocity[-2:].norm(dim=-1).amax(0) * motion.dt_s
+    return torch.minimum((motion.position[-1] - motion.position[-2]).norm(dim=-1), reach).sum(-1)
 
 
-def _changed(before: Trajectory, after: Trajectory) -> Tensor:
+def changed_rollouts(before: Trajectory, after: Trajectory) -> Tensor:
     """bool [B]: the rollouts whose last instant differs."""
     if before is after:
         return torch.zeros(before.batch, dtype=torch.bool)
