@@ -3,6 +3,7 @@
 import functools
 import json
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -48,7 +49,7 @@ def test_the_truth_passes_and_injected_violations_of_twice_the_tolerance_do_not(
 @pytest.mark.parametrize("name", ["mujoco:blocks", "physics:stacking"])
 def test_tolerances_calibrated_on_mujoco_hold_and_detect(name):
     pytest.importorskip("mujoco")
-    options = {"cameras": (), "threads": 1} if name.startswith("mujoco") else {"pictures": False}
+    options: dict[str, Any] = {"cameras": (), "threads": 1} if name.startswith("mujoco") else {"pictures": False}
     world = terrella.load(name, **options)
     system = PhysicalSystem.from_json(world.spec.system)
     assert not system.hidden
