@@ -3,7 +3,7 @@
 import functools
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -24,7 +24,7 @@ UPRIGHT = torch.tensor([1.0, 0, 0, 0]).double()
 
 
 @functools.cache
-def truth(family: str, seed: int, batch: int, split: str = "in"):
+def truth(family: str, seed: int, batch: int, split: Literal["in", "out"] = "in"):
     world = BodiesWorld(family, BodiesConfig(split, pictures=False))
     system = PhysicalSystem.from_json(world.spec.system)
     waits = torch.zeros(STEPS, batch, dtype=torch.long)
