@@ -68,7 +68,7 @@ def throws(truth: World, episodes: int, plans: int, steps: int, seed: int) -> Ca
 def pushes(truth: World, episodes: int, plans: int, steps: int, seed: int) -> Candidates:
     """Movements of an arm to four places one after the other; episodes whose target is where something was pushed to."""
     channels, rng = PhysicalSystem.from_json(truth.spec.system).channels, make_rng(seed)
-    tries = 3 * episodes
+    tries = 6 * episodes
     started = rollout(
         truth, truth.start(tries, rng), terrella.load_policy("random", truth.spec), rng, (), steps=40
     ).final
