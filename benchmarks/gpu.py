@@ -230,13 +230,19 @@ def robot(row: Row, settings: Settings) -> Row:
     ]:
         row.error = f"not measured, without {', '.join(absent)}"
         return row
-    world = terrella.load("mujoco:go1", cameras=(), **({} if settings.cpu else {"device": "cuda"}))
-    rng = make_rng(0)
-    state, names = world.start(row.batch, rng), [name for name in world.spec.channels if name in ("qpos", "qvel")]
+    world = terrella.load("mujoco:go1", cameras=(), device="" if settings.cpu else "cuda")
+    rng, names = (
+        make_rng(0),
+        [name for name in world.spec.channels if name in ("observation", "qpos", "qvel", "reward")],
+    )
+    state = fresh = world.start(row.batch, rng)
+    low, high = (torch.as_tensor(limit, device=state.device) for limit in world.spec.action_limits)
 
     def run() -> None:
         nonlocal state
-        state = world.imagine(state, world.spec.sample_action(row.batch, rng), rng)
+        action = torch.lerp(low, high, torch.rand(row.batch, len(low), device=state.device))
+        state = world.imagine(state, action, rng)
+        state = state.mixed(state["done"], fresh)
         world.render(state, names)
 
     many = world.spec.dt_s / 0.005  # steps of 5 ms in one of the world
@@ -244,7 +250,7 @@ def robot(row: Row, settings: Settings) -> Row:
     return row
 
 
-def runs_per_second(run: Callable[[], None], settings: Settings) -> float:
+def runs_per_second(run: Callable[[], Any], settings: Settings) -> float:
     run()
     run()
     wait(settings)
@@ -263,7 +269,7 @@ def wait(settings: Settings) -> None:
         torch.cuda.synchronize()
 
 
-def profiled(run: Callable[[], None], settings: Settings) -> dict[str, Any]:
+def profiled(run: Callable[[], Any], settings: Settings) -> dict[str, Any]:
     """What a run does: launches, share of the time in which the device works, the ten kernels that take longest in milliseconds."""
     activities = [torch.profiler.ProfilerActivity.CPU] + [torch.profiler.ProfilerActivity.CUDA] * (not settings.cpu)
     began = time.perf_counter()
@@ -310,6 +316,7 @@ def main(settings: Settings) -> int:
     device = torch.cuda.get_device_name() if not settings.cpu else "CPU (a rehearsal)"
     print(f"{device}, PyTorch {torch.__version__}", flush=True)
     rows = []
+    jobs: list[tuple[Row, Callable[..., Row]]]
     jobs = [(row, lambda row, make=make: measured(row, make, settings)) for row, make in rows_of(settings)]
     jobs.append((Row("flow training", 2 if settings.cpu else 128, 5000), lambda row: trained(row, settings)))
     jobs.append((Row("go1", 2 if settings.cpu else 8192, 1.5e6), lambda row: robot(row, settings)))

@@ -14,10 +14,14 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
+from terrella.act.actor_network import ActorConfig, ActorNetwork
+from terrella.act.choices import Choices
 from terrella.core import make_rng
 from terrella.learn.objectives.flow_frames import RECORDED, FlowClips, FlowFrames
+from terrella.learn.objectives.group_relative import GroupRelative
 from terrella.learn.objectives.scroll import LENGTH, ScrollClips, ScrollObjective
 from terrella.learn.train_step import TrainStep
+from terrella.learn.verified_rollouts import GroupedRollouts
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 
 _setup_privateuseone_for_python_backend("other")
@@ -81,18 +85,24 @@ def main() -> None:
     flow = FlowFrames(network, 1e-3, 3, 2.0)
     seen = FlowClips(truth, torch.zeros(4, 7, 2), torch.randint(0, 256, (4, 3, 4, *size), dtype=torch.uint8))
     scrolling = object.__new__(ScrollObjective)  # without a recording
+    assert network.scrolling is not None
     scrolling.scroll, scrolling.moves, scrolling.slots = network.scrolling, moves, 4
+    actor = ActorNetwork(ActorConfig((("observation", (3,)),), "axes", (2,), (-1.0, -1.0), (1.0, 1.0), 8))
+    groups = GroupRelative(actor, 1e-3, 0.3)
+    rollouts = torch.ones(2, 8), torch.arange(8.0).view(2, 4) ** 2  # weights and rewards lie on the CPU
     with Pretended():
-        for module in flow.modules.values():
+        for module in (*flow.modules.values(), actor):
             module.to(OTHER)
         try:
             network.moves + moves
         except RuntimeError:
             print("mixing is refused")
         late = replace(now, share=0.9)
-        for losses in (flow.losses(seen, late), scrolling.losses(piece, now)):
+        choices = Choices({"observation": torch.rand(16, 3).to(OTHER)}, torch.rand(16, 2).to(OTHER))
+        grouped = groups.losses(GroupedRollouts(choices, *rollouts), now)
+        for losses in (flow.losses(seen, late), scrolling.losses(piece, now), [next(grouped)]):
             for loss in losses:
-                assert loss.value.device == OTHER
+                assert {part.device for part in (loss.value, *loss.parts.values())} == {OTHER}
                 print(f"{loss.learner} has a loss")
 
 

@@ -14,6 +14,7 @@ from terrella.core.errors import TrainingError
 from terrella.learn.devices import Compiled
 from terrella.learn.presets import GIB, PRESETS, STEPS, TrainingPlan
 from terrella.learn.recipes.video import train_video
+from terrella.learn.recipes.video_config import TrainConfig
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world
 
@@ -38,6 +39,12 @@ def test_the_presets_have_as_many_parameters_as_they_say():
 )  # fmt: skip
 def test_the_device_and_the_minutes_choose(device, minutes, name):
     assert plan(device, minutes).preset.name == name
+
+
+def test_a_day_is_a_day_and_not_the_default():
+    day, default = TrainConfig(hours=24.0), TrainConfig()
+    assert day.limit_hours == default.limit_hours == 24 and (day.minutes, default.minutes) == (1440, None)
+    assert [plan(CARD, config.minutes).preset.name for config in (day, default)] == ["huge", "medium"]
 
 
 def test_a_card_too_small_has_the_next_smaller_and_says_so():

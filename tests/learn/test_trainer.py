@@ -10,19 +10,23 @@ import signal
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 from tests.learn.stopping import logged, quiet, saved_facts
 from torch import nn
 
+from terrella.core import chance, make_rng
 from terrella.core.errors import TrainingError
 from terrella.learn import train_step
 from terrella.learn import trainer as module
 from terrella.learn.budget import Budget, Stage
 from terrella.learn.learners import Ema, adamw, warmup_cosine
 from terrella.learn.sized_feed import SizedFeed
+from terrella.learn.train_step import TrainStep
 from terrella.learn.trainer import Loss, Run, Trainer
 
 STEPS = 7
@@ -259,6 +263,21 @@ def test_a_device_out_of_memory_halves_the_batch_says_so_and_goes_on(tmp_path):
         Trainer(
             Run.of(tmp_path / "small", Settings(), quiet), "toy", SizedFeed(lambda size: Fed(size, 0), 2), Toy(), STEPS
         ).train()
+
+
+def test_a_feed_that_cannot_shrink_says_what_to_do_where_memory_is_out(tmp_path):
+    with pytest.raises(TrainingError, match="cpu has too little memory for this batch; give a smaller --batch, or"):
+        Trainer(Run.of(tmp_path, Settings(), quiet), "toy", Fed(4, 2), Toy(), STEPS).train()
+
+
+def test_worlds_are_seeded_by_a_generator_of_the_cpu():
+    """One of a GPU would draw the seeds of a batch one by one."""
+    given, drawn = torch.device("cpu"), make_rng(5)
+    assert TrainStep(0, 0.0, given, np.random.default_rng(0), drawn).seeding is drawn
+    far: Any = SimpleNamespace(device=torch.device("cuda"), initial_seed=lambda: 5)
+    step = TrainStep(0, 0.0, given, np.random.default_rng(0), far)
+    assert step.seeding is step.seeding and step.seeding.device.type == "cpu"
+    assert torch.equal(chance.seeds(3, step.seeding), chance.seeds(3, make_rng(5)))
 
 
 def test_progress_says_step_and_rate(tmp_path):

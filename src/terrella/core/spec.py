@@ -136,7 +136,7 @@ class Spec:
 
     def check_action(self, action: torch.Tensor, batch: int) -> torch.Tensor:
         """The action as a tensor [batch, *action.shape] of the dtype of the space, with its gradient; ActionError where its shape,
-        type or a value does not fit the space."""
+        type or a value does not fit the space. Values on a device other than the CPU are not looked at."""
         import torch
 
         low, high = self.action_limits
@@ -147,7 +147,7 @@ class Spec:
             raise ActionError(f"{self.name} takes an action of numbers of shape {shape}; got {action!r}.") from error
         if tuple(tensor.shape) != shape:
             raise ActionError(f"{self.name} takes an action of shape {shape} (batch first); got {tuple(tensor.shape)}.")
-        if tensor.device.type == "meta":  # which has no values to check
+        if tensor.device.type != "cpu":  # to look at a value is to wait for the device
             return tensor.to(torch_dtype_of(self.action))
         if tensor.is_complex() or not torch.isfinite(tensor).all():
             raise ActionError(f"{self.name} was given an action that is not a finite number.")

@@ -158,6 +158,16 @@ class State(Mapping):
 
         return self._combined([self, fresh.into(self._arenas)], put, put)
 
+    def mixed(self, where: torch.Tensor, other: State) -> State:
+        """This state with its entries `where` (bool [B]) replaced by those of `other` [B]: `put` without waiting for how many."""
+        if set(other) != set(self) or self.deferred is not None or self._arenas:
+            raise ValueError("mixed takes two states of tensors alone, of the same world")
+
+        def mix(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
+            return mine if mine is theirs else torch.where(where.view(-1, *[1] * (mine.ndim - 1)), theirs, mine)
+
+        return State({name: mix(mine, other[name]) for name, mine in self.items()})
+
     @staticmethod
     def stack(states: Sequence[State]) -> State:
         """States joined along the batch axis."""

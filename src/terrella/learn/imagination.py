@@ -86,10 +86,14 @@ class ContinuedEpisodes:
 
     def begin(self, now: TrainStep) -> State:
         if self.anew:
-            return self.world.start(len(self.held.age), now.noise)
+            return self.world.start(len(self.held.age), now.seeding)
         state, over = self.held.state(), self.held.age >= self.longest
+        if state.device.type != "cpu":  # a whole batch begins anew, of which some are taken: nothing waits for how many
+            fresh = self.world.start(len(over), now.seeding)
+            self.held.age.masked_fill_(over, 0)
+            return state.mixed(over, fresh)
         if over.any():
-            fresh = self.world.start(int(over.sum()), now.noise)
+            fresh = self.world.start(int(over.sum()), now.seeding)
             state = state.put(over.nonzero()[:, 0].to(state.device), fresh)
             self.held.age[over] = 0
         return state
@@ -101,7 +105,7 @@ class ContinuedEpisodes:
         self.held.hold(state)
         self.held.age += steps
         if over is not None:
-            self.held.age[over.to(self.held.age.device)] = self.longest
+            self.held.age.masked_fill_(over.to(self.held.age.device), self.longest)
 
     def sample(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]:
         """Observations of some episodes of random play."""
@@ -121,7 +125,7 @@ class _Held(nn.Module):
     def __init__(self, state: State, age: np.ndarray):
         super().__init__()
         self.names = tuple(state)
-        self.register_buffer("age", torch.from_numpy(age.astype(np.int64)))
+        self.register_buffer("age", torch.from_numpy(age.astype(np.int64)).to(state.device))
         for number, name in enumerate(self.names):
             self.register_buffer(f"tensor{number}", state[name].clone())
 
@@ -178,8 +182,8 @@ class Imagination:
         channels = tuple(dict.fromkeys((*observed, *outcomes)))
         frames, actions, steps = [dict(world.render(state, channels))], [], []
         for _ in range(self.steps):
-            actions.append(self.network(frames[-1]).sample(now.noise))
-            state = world.imagine(state, config.actions(actions[-1], spec).to(state.device), now.noise)
+            actions.append(self.network(frames[-1]).sample(now.seeding))
+            state = world.imagine(state, config.actions(actions[-1], spec).to(state.device), now.seeding)
             frames.append(dict(world.render(state, channels)))
             steps.append(self._outcome(frames[-1], now.device))
         reward, continues, trusted = (torch.stack(parts) for parts in zip(*steps))

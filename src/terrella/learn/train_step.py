@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
 
+from ..core.world import make_rng
 from .devices import half_is_native, half_precision
 
 
@@ -33,6 +35,11 @@ class TrainStep:
     def rand(self, *shape: int) -> torch.Tensor:
         """Uniform noise in 0..1, likewise."""
         return torch.rand(*shape, generator=self.noise, device=self._drawn_on).to(self.device)
+
+    @cached_property
+    def seeding(self) -> torch.Generator:
+        """The generator for worlds and policies, which draw seeds: on the CPU, where those of a batch are drawn at once."""
+        return self.noise if self.noise.device.type == "cpu" else make_rng(self.noise.initial_seed())
 
     @property
     def _drawn_on(self) -> torch.device:

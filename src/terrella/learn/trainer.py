@@ -223,9 +223,12 @@ class Trainer:
             if len(facts["recent"]) == LOG_EVERY or self.finished:
                 self._check_finite()
             return True
-        except torch.OutOfMemoryError:
+        except torch.OutOfMemoryError as error:
             if not isinstance(self.feed, SizedFeed):
-                raise
+                raise TrainingError(
+                    f"{self.device} has too little memory for this batch; give a smaller --batch, or compute on the CPU. What was "
+                    f"saved before is in {self.run.out}."
+                ) from error
         except _NotFinite as error:
             self._go_on_in_float32(error)
             return False

@@ -48,7 +48,7 @@ class WorldStarts:
     world: World
 
     def begin(self, groups: int, now: TrainStep) -> tuple[State, Observation]:
-        return self.world.start(groups, now.noise), {}
+        return self.world.start(groups, now.seeding), {}
 
 
 class ReferenceStarts:
@@ -116,17 +116,17 @@ class VerifiedRollouts:
         paths = {name: path.repeat_interleave(self.size, 0) for name, path in paths.items()}
         outcome = [name for name in ("done", "reward") if name in world.spec.channels]
         channels = tuple(dict.fromkeys((*self.policy.sees, *criterion.channels, *outcome, *paths)))
-        memory, choices, weights = self.policy.begin(count, now.noise), list[Choices](), list[torch.Tensor]()
+        memory, choices, weights = self.policy.begin(count, now.seeding), list[Choices](), list[torch.Tensor]()
         seen = world.render(state, channels)
         going, success, total = torch.ones(count), torch.zeros(count), torch.zeros(count)
         away = [self._apart(paths, seen, 0)] if paths else []
         for step in range(self.steps):
             shown = {name: self._shown(name, seen[name]) for name in self.policy.sees}
-            action, memory, chosen = self.policy.explore(shown, memory, now.noise)
+            action, memory, chosen = self.policy.explore(shown, memory, now.seeding)
             if chosen is not None:
                 choices.append(chosen)
                 weights.append(going.clone())
-            state = world.imagine(state, action.to(state.device), now.noise)
+            state = world.imagine(state, action.to(state.device), now.seeding)
             seen = world.render(state, channels)
             if "reward" in seen:
                 total += going * seen["reward"].cpu().float()

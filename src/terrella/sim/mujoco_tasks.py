@@ -1,7 +1,7 @@
 """Tasks of MuJoCo robots: initial states, reward, termination and observations, for whole batches at once."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,6 +10,7 @@ from gymnasium import spaces
 from torch import Tensor
 
 from ..core import chance
+from ..core.backend import constant, table
 from ..core.errors import TerrellaError
 from ..core.similar import did_you_mean
 
@@ -34,10 +35,17 @@ class RobotLayout:
     sensors: Mapping[str, slice]  # sensor -> columns of the sensor data
     step_s: float  # seconds of a control step
 
+    def to(self, device: torch.device, dtype: torch.dtype) -> "RobotLayout":
+        """The same on a device, for states of a type."""
+        own, place = self.hinges
+        numbers = {name: getattr(self, name).to(device, dtype) for name in ("home", "rest", "low", "high")}
+        return replace(self, hinges=(own.to(device), place.to(device)), **numbers)
+
 
 class RobotTask(Protocol):
     """channels: those that `render` shows; initialise: changes the initial qpos [B, nq] and qvel [B, nv] in place and returns the
-    task's own tensors of the state; evaluate: reward, termination and the task's tensors after a step."""
+    task's own tensors of the state; evaluate: reward, termination and the task's tensors after a step. A task whose `on_device` is
+    True computes where the state lies, in its type; another on the CPU in float64."""
 
     rewards: bool  # whether `reward` is a channel
 
@@ -50,7 +58,7 @@ class RobotTask(Protocol):
 class Free:
     """No task: the robot starts as in its file, and observes qpos, qvel and its sensors."""
 
-    rewards = False
+    rewards, on_device = False, True
 
     def __repr__(self) -> str:  # of a world's fingerprint
         return "Free()"
@@ -68,8 +76,8 @@ class Free:
         return {}
 
     def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
-        batch = len(after["physics"])
-        return torch.zeros(batch), torch.zeros(batch, dtype=torch.bool), {}
+        reward = torch.zeros(len(after["physics"]), device=after["physics"].device)
+        return reward, torch.zeros_like(reward, dtype=torch.bool), {}
 
     def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         physics = state["physics"]
@@ -81,7 +89,7 @@ class VelocityTracking:
     """A free body follows a commanded velocity (Rudin et al. 2021, "Learning to walk in minutes"). `command` is forward and
     sideways in m/s and turning in rad/s, in the body's frame, drawn uniformly within these limits when an episode starts."""
 
-    rewards = True
+    rewards, on_device = True, True
     forward: tuple[float, float] = (0.3, 1.0)  # m/s
     sideways: tuple[float, float] = (0.0, 0.0)  # m/s
     turning: tuple[float, float] = (-0.5, 0.5)  # rad/s
@@ -113,20 +121,20 @@ class VelocityTracking:
 
     def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
         joints = qpos.shape[1] - 7
-        drawn = 2 * chance.uniform(seeds, (joints + qvel.shape[1] + 1,), _START).double() - 1
+        drawn = 2 * chance.uniform(seeds, (joints + qvel.shape[1] + 1,), _START).to(qpos) - 1
         qpos[:, 7:] += self.noise * drawn[:, :joints]
         qvel += self.noise * drawn[:, joints:-1]
         half = torch.pi / 2 * drawn[:, -1]
         heading = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
         qpos[:, 3:7] = quaternion_product(heading, qpos[:, 3:7])
-        limits = torch.tensor([self.forward, self.sideways, self.turning])
+        limits = constant(table, seeds.device, self.forward, self.sideways, self.turning)
         command = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * chance.uniform(seeds, (3,), _GOAL)
         return {"command": command}
 
     def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         height, tilt = self.fallen[1], self.fallen[0]
         up, qpos = motion(layout, after["physics"])[2], after["physics"][:, layout.qpos]
-        fallen = (up[:, 2] < np.cos(tilt)) | (qpos[:, 2] < height * layout.home[2])
+        fallen = (up[:, 2] < float(np.cos(tilt))) | (qpos[:, 2] < height * layout.home[2])
         return self._reward(layout, before, after).clamp_min(0.0).float(), fallen, {"command": after["command"]}
 
     def _reward(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Tensor:
@@ -196,7 +204,8 @@ class Stepping(VelocityTracking):
             lift_error = (place[:, 2] - self.lift_m).square()
             gait = 0.6 * (contact == stance) - 40.0 * lift_error * ~stance - 0.4 * speed.square().sum(1) * contact
             reward = reward + gait / len(self.feet)
-        joints = (after["physics"][:, layout.qpos][:, 7:] - layout.home[7:])[:, list(self.straight)]
+        straight = constant(_columns, sensors.device, *self.straight)
+        joints = (after["physics"][:, layout.qpos][:, 7:] - layout.home[7:])[:, straight]
         return reward - joints.square().sum(1)
 
 
@@ -205,7 +214,7 @@ class Reach:
     """The hand reaches a goal, drawn uniformly in a box when an episode starts. Reward: minus the distance in m. Observation:
     joints, their speeds, the goal, and the vector from the goal to the hand."""
 
-    rewards = True
+    rewards, on_device = True, True
     hand: str = "hand"  # sensor of the hand's position
     low: tuple[float, float, float] = (0.2, -0.2, 0.1)  # corners of the box, m
     high: tuple[float, float, float] = (0.45, 0.2, 0.4)
@@ -219,13 +228,13 @@ class Reach:
         }
 
     def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
-        low, high = torch.tensor(self.low), torch.tensor(self.high)
+        low, high = constant(table, seeds.device, self.low, self.high).unbind(0)
         goal = low + (high - low) * chance.uniform(seeds, (3,), _GOAL)
         return {"goal": goal, MARKER: goal.double()}
 
     def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         distance = (after["sensors"][:, layout.sensors[self.hand]] - after["goal"]).norm(dim=1)
-        return -distance.float(), torch.zeros(len(distance), dtype=torch.bool), {"goal": after["goal"]}
+        return -distance.float(), torch.zeros_like(distance, dtype=torch.bool), {"goal": after["goal"]}
 
     def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         hand = state["sensors"][:, layout.sensors[self.hand]]
@@ -241,7 +250,7 @@ class Hold:
     """The hand reaches a goal in its plane (x, z), drawn in a ring around the origin when an episode starts, and holds it:
     `success` is 1 after `dwell` consecutive steps within `within` m."""
 
-    rewards = True
+    rewards, on_device = True, True
     hand: str = "hand"  # sensor of the hand's position
     ring: tuple[float, float] = (0.2, 0.45)  # radii, m
     within: float = 0.03  # m
@@ -258,22 +267,22 @@ class Hold:
         return {"observation": (numbers(3 * joints + 4), ""), "success": (numbers(), ""), "away": (numbers(), "m")}
 
     def initialise(self, layout: RobotLayout, seeds: Tensor, qpos: Tensor, qvel: Tensor) -> dict[str, Tensor]:
-        drawn = chance.uniform(seeds, (qpos.shape[1] + qvel.shape[1],), _START).double()
-        angle, radius = chance.uniform(seeds, (2,), _GOAL).double().unbind(1)
+        drawn = chance.uniform(seeds, (qpos.shape[1] + qvel.shape[1],), _START).to(qpos)
+        angle, radius = chance.uniform(seeds, (2,), _GOAL).to(qpos).unbind(1)
         qpos += self.start[0] * (2 * drawn[:, : qpos.shape[1]] - 1)
         qvel += self.start[1] * (2 * drawn[:, qpos.shape[1] :] - 1)
         low, high = self.ring
         length, turn = (low**2 + (high**2 - low**2) * radius).sqrt(), 2 * torch.pi * angle
         goal = torch.stack([length * turn.cos(), length * turn.sin()], 1)
-        marker = torch.stack([goal[:, 0], torch.zeros(len(goal)), goal[:, 1]], 1).double()
-        return {"goal": goal, MARKER: marker, "held": torch.zeros(len(goal), dtype=torch.int64)}
+        marker = torch.stack([goal[:, 0], 0 * goal[:, 0], goal[:, 1]], 1).double()
+        return {"goal": goal, MARKER: marker, "held": torch.zeros_like(goal[:, 0], dtype=torch.int64)}
 
     def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
         distance = self._from_goal(layout, after).norm(dim=1)
         speed = after["physics"][:, layout.qvel].square().sum(1)
-        held = torch.where(distance <= self.within, before["held"] + 1, 0)
+        held = (before["held"] + 1) * (distance <= self.within)
         reward = torch.exp(-(distance / self.within).square()) - 2 * distance - 0.002 * speed
-        return reward.float(), torch.zeros(len(distance), dtype=torch.bool), {"goal": after["goal"], "held": held}
+        return reward.float(), torch.zeros_like(distance, dtype=torch.bool), {"goal": after["goal"], "held": held}
 
     def render(self, layout: RobotLayout, state: Tensors, name: str) -> Tensor:
         if name == "success":
@@ -286,7 +295,7 @@ class Hold:
 
     def _from_goal(self, layout: RobotLayout, state: Tensors) -> Tensor:
         """The vector from the goal to the hand [B, 2], m."""
-        return state["sensors"][:, layout.sensors[self.hand]][:, [0, 2]] - state["goal"]
+        return state["sensors"][:, layout.sensors[self.hand]][:, ::2] - state["goal"]
 
 
 TASKS: Mapping[str, Callable[..., RobotTask]] = {"hold": Hold, "reach": Reach, "velocity": VelocityTracking}
@@ -332,8 +341,12 @@ def motion(layout: RobotLayout, physics: Tensor) -> tuple[Tensor, Tensor, Tensor
     turn, velocity = physics[:, layout.qpos][:, 3:7], physics[:, layout.qvel]
     up = torch.zeros_like(velocity[:, :3])
     up[:, 2] = 1
-    back = turn * torch.tensor([1.0, -1, -1, -1], dtype=turn.dtype)
+    back = turn * constant(table, turn.device, 1.0, -1.0, -1.0, -1.0).to(turn.dtype)
     return rotate(back, velocity[:, :3]), velocity[:, 3:6], rotate(back, up)
+
+
+def _columns(*columns: int) -> Tensor:
+    return torch.tensor(columns, dtype=torch.int64)
 
 
 def rotate(turn: Tensor, vector: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 # pyright: reportAttributeAccessIssue=false, reportMissingImports=false
 
+from copy import copy
 from typing import Any
 
 import torch
@@ -10,10 +11,23 @@ from ..core.errors import TerrellaError
 from .mujoco_model import mujoco
 from .mujoco_stepping import Stepper
 
+ON_CPU = "warp:cpu"  # the device on which mujoco-warp steps without a GPU, for tests
+CONTACTS = 64  # of a world, on average over the batch
+BATCHES = 4  # sizes of batches whose arrays are kept
+
+
+def torch_device(name: str) -> torch.device:
+    """Where states lie that are stepped on a device of MujocoConfig; TerrellaError for no device."""
+    try:
+        return torch.device("cpu" if name in ("", ON_CPU) else name)
+    except RuntimeError as error:
+        raise TerrellaError(f"there is no device '{name}'; give cuda or cuda:1, or leave `device` out.") from error
+
 
 class WarpStepper(Stepper):
-    """Worlds of one model on one CUDA device, in float32; states are CPU tensors. Contacts and LiDAR stay with MuJoCo on the CPU.
-    Parameters cannot differ between worlds. TerrellaError without mujoco-warp or a GPU."""
+    """Worlds of one model on one device, in float32: physics, controls, sensors and the solver's warmstart stay there. Contacts
+    and LiDAR are computed by MuJoCo on the CPU. Parameters cannot differ between worlds. TerrellaError without mujoco-warp or a
+    GPU, and for a model with something that mujoco-warp lacks."""
 
     def __init__(self, file: mujoco.MjModel, device: str):
         super().__init__(file, {}, 1)
@@ -22,58 +36,63 @@ class WarpStepper(Stepper):
             import warp
         except ImportError as error:
             raise TerrellaError("stepping MuJoCo on a GPU needs mujoco-warp: pip install mujoco-warp.") from error
+        warp.config.quiet = True
         warp.init()
-        if not warp.is_cuda_available():
+        if device != ON_CPU and not warp.is_cuda_available():
             raise TerrellaError("mujoco-warp finds no CUDA GPU; leave `device` out to step on the CPU.")
-        self._warp, self._mjw, self._device = warp, mujoco_warp, warp.get_device(device)
-        with warp.ScopedDevice(self._device):
-            self._model = mujoco_warp.put_model(file)
-        self._held: dict[int, Any] = {}  # batch -> its data
-        self._graphs: dict[tuple[int, int], Any] = {}  # (batch, steps) -> captured graph
+        self._warp, self._mjw = warp, mujoco_warp
+        self._device = warp.get_device(device.removeprefix("warp:"))
+        self._fields = {"qpos": file.nq, "qvel": file.nv, **({"act": file.na} if file.na else {})}
+        self._source = copy(file)  # mujoco-warp never resets a world, and does not know that it should not
+        self._source.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        try:
+            with warp.ScopedDevice(self._device):
+                self._model = mujoco_warp.put_model(self._source)
+        except (NotImplementedError, ValueError) as error:
+            raise TerrellaError(
+                f"mujoco-warp cannot step this model ({error}); leave `device` out to step on the CPU."
+            ) from error
+        self._held: dict[tuple[int, int], tuple[Any, Any]] = {}  # (batch, steps) -> its data and CUDA graph
 
     def step(
         self, physics: torch.Tensor, warmstart: torch.Tensor, ctrl: torch.Tensor, values: torch.Tensor, steps: int
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        model, batch = self.file, len(physics)
+        """The same as `Stepper.step`, of float32 tensors on the device."""
+        data, graph = self._prepared(len(physics), steps)
+        held = {name: self._warp.to_torch(getattr(data, name)) for name in ("qacc_warmstart", "ctrl", "sensordata")}
+        time = self._warp.to_torch(data.time)
+        parts = [self._warp.to_torch(getattr(data, name)) for name in self._fields]
+        time.copy_(physics[:, 0])
+        for mine, given in zip(parts, physics[:, 1:].split(list(self._fields.values()), 1)):
+            mine.copy_(given)
+        held["qacc_warmstart"].copy_(warmstart)
+        held["ctrl"].copy_(ctrl)
+        if graph is None:
+            self._run(data, steps)
+        else:
+            self._warp.capture_launch(graph, stream=self._warp.stream_from_torch(torch.cuda.current_stream()))
+        after = torch.cat([time[:, None], *parts], 1)
+        return after, held["sensordata"].clone(), held["qacc_warmstart"].clone()
+
+    def _prepared(self, batch: int, steps: int) -> tuple[Any, Any]:
+        """Arrays for a batch, and on a GPU `steps` steps on them as a CUDA graph."""
+        if (batch, steps) not in self._held:
+            if len(self._held) >= BATCHES:
+                self._held.pop(next(iter(self._held)))
+            rows = 6 * CONTACTS + 4 * self.file.nv + 6 * self.file.neq  # of constraints in a world
+            with self._warp.ScopedDevice(self._device):
+                data = self._mjw.make_data(self._source, nworld=batch, nconmax=CONTACTS, njmax=rows)
+                graph = None
+                if self._device.is_cuda:
+                    self._run(data, 1)  # compiles kernels, which is not possible during a capture
+                    with self._warp.ScopedCapture() as capture:
+                        self._run(data, steps)
+                    graph = capture.graph
+                    self._warp.synchronize_device(self._device)
+            self._held[batch, steps] = data, graph
+        return self._held[batch, steps]
+
+    def _run(self, data: Any, steps: int) -> None:
         with self._warp.ScopedDevice(self._device):
-            data = self._data(batch)
-            ends = (1, 1 + model.nq, 1 + model.nq + model.nv, 1 + model.nq + model.nv + model.na)
-            fields = ["qpos", "qvel", *(["act"] if model.na else [])]
-            parts = {name: slice(*at) for name, at in zip(fields, zip(ends, ends[1:]))}
-            held = {
-                name: self._warp.to_torch(getattr(data, name)) for name in (*fields, "time", "qacc_warmstart", "ctrl")
-            }
-            for name, at in parts.items():
-                held[name].copy_(physics[:, at])
-            held["time"].copy_(physics[:, 0])
-            held["qacc_warmstart"].copy_(warmstart)
-            held["ctrl"].copy_(ctrl)
-            self._run(data, batch, steps)
-            after = physics.clone()
-            for name, at in parts.items():
-                after[:, at] = held[name].double().cpu()
-            after[:, 0] = held["time"].double().cpu()
-            sensed = self._warp.to_torch(data.sensordata).double().cpu()
-            return after, sensed, held["qacc_warmstart"].double().cpu()
-
-    def _data(self, batch: int) -> Any:
-        if batch not in self._held:
-            self._held[batch] = self._mjw.make_data(self.file, nworld=batch)
-        return self._held[batch]
-
-    def _run(self, data: Any, batch: int, steps: int) -> None:
-        """Runs `steps` steps as one CUDA graph, captured at the first call."""
-        key = batch, steps
-        if key not in self._graphs:
-            before = {
-                name: self._warp.clone(getattr(data, name))
-                for name in ("qpos", "qvel", "act", "time", "qacc_warmstart")
-            }
-            self._mjw.step(self._model, data)  # compiles kernels, which is not possible during a capture
-            with self._warp.ScopedCapture() as capture:
-                for _ in range(steps):
-                    self._mjw.step(self._model, data)
-            self._graphs[key] = capture.graph
-            for name, value in before.items():
-                self._warp.copy(getattr(data, name), value)
-        self._warp.capture_launch(self._graphs[key])
+            for _ in range(steps):
+                self._mjw.step(self._model, data)

@@ -20,20 +20,22 @@ import torch
 from gymnasium import spaces
 
 from ..core import chance
+from ..core.backend import constant
 from ..core.errors import ObservationError, TerrellaError
 from ..core.spec import DONE, POSE, POSE_UNIT, REWARD, Spec, kind_of, suffix_of
 from ..core.state import State
 from .mujoco_appearance import patterned
-from .mujoco_controls import ControlLimits, control_mode, control_name, control_unit, controls_of
+from .mujoco_controls import control_mode, control_name, control_unit, controls_of
+from .mujoco_layout import layout_of, pose_at_rest
 from .mujoco_lidar import SITE, Lidar
-from .mujoco_model import BALL, FREE, bare, compiled, complete, coupled_joints, home_key, mujoco, read
+from .mujoco_model import bare, compiled, complete, mujoco, read
 from .mujoco_parameters import TEXTURES, checked, parameters_of
 from .mujoco_renderer import MujocoRenderer, lens
 from .mujoco_robots import Robot, robot_of
 from .mujoco_stepping import Stepper
 from .mujoco_system import system_of
-from .mujoco_tasks import MARKER, RobotLayout, RobotTask, numbers, task_of
-from .mujoco_warp import WarpStepper
+from .mujoco_tasks import MARKER, RobotTask, numbers, task_of
+from .mujoco_warp import WarpStepper, torch_device
 
 FILES = (".xml", ".mjcf", ".urdf")
 MAX_SPEED = 1e4  # m/s or rad/s; a faster world is unstable
@@ -68,7 +70,8 @@ class MujocoConfig:
     pilot: bool = True
     # Threads that step worlds. Default: the processors of this process.
     threads: int | None = None
-    # "cuda" steps on a GPU with mujoco-warp in float32 (sim/mujoco_warp.py); states stay CPU tensors.
+    # "cuda" steps on a GPU with mujoco-warp in float32 (sim/mujoco_warp.py), where states stay; "warp:cpu" does so on a CPU, for
+    # tests.
     device: str = ""
     # Names in `parameters_of` whose values differ between worlds: `state["parameters"]` [B, n].
     parameters: Sequence[str] = ()
@@ -88,6 +91,9 @@ class MujocoWorld:
 
     TerrellaError for missing or broken files. An unstable world ends with a warning, and the state before is saved with its
     action: imagine(state, state["action"], rng) repeats the step.
+
+    On a device all tensors lie there and numbers are float32. Nothing waits for a value: actions are not checked, and an unstable
+    world just ends.
     """
 
     def __init__(self, name: str | Path | Robot, config: MujocoConfig = MujocoConfig()):
@@ -105,13 +111,14 @@ class MujocoWorld:
         self.file.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.name = f"mujoco:{label}"
         self._steps = max(1, round((config.control_s or (robot.control_s if robot else 0.02)) / self.file.opt.timestep))
-        self._threads, self._device = config.threads or _cores(), config.device
+        self._threads, self._device = config.threads or _cores(), "" if config.device == "cpu" else config.device
+        self.device, self._dtype = torch_device(self._device), torch.float32 if self._device else torch.float64
         self._dumped = 0
         self._dumps = Path(config.dumps or Path(tempfile.gettempdir()) / f"terrella-unstable-{getpass.getuser()}")
-        home = _home(self.file, robot)
+        home = pose_at_rest(self.file, robot)
         self._controls = controls_of(self.file, home)
         self.task: RobotTask = task or (robot.task if robot else task_of(spec, label))
-        self.layout = _layout(self.file, home, self._controls, self._steps)
+        self.layout = layout_of(self.file, home, self._controls, self._steps).to(self.device, self._dtype)
         wanted = config.cameras if config.cameras is not None or robot is None else robot.cameras or None
         self._cameras = _cameras(self._seen, wanted)
         shown = (("depth", config.depth), ("segmentation", config.segmentation))
@@ -143,13 +150,23 @@ class MujocoWorld:
         self.varied, changes = tuple(names), [self.parameters[name] for name in names]
         seen = {names.index(name): one for name, one in self.parameters.items() if name in names and one.seen}
         stepped = {at: one for at, one in enumerate(changes) if not one.seen}
-        on_gpu = self._device not in ("", "cpu")
-        if on_gpu and stepped:
-            raise TerrellaError("physics that differs between worlds needs the CPU; leave device out.")
-        self._stepper = WarpStepper(self.file, self._device) if on_gpu else Stepper(self.file, stepped, self._threads)
+        if self._device:
+            self._check_device(stepped)
+            self._stepper = WarpStepper(self.file, self._device)
+        else:
+            self._stepper = Stepper(self.file, stepped, self._threads)
         drawn = patterned(self._source, self.name) if TEXTURES in changes else copy(self._seen)
         self._renderer = MujocoRenderer(drawn, seen, self._size)
         self.spec = self._describe()
+
+    def _check_device(self, stepped: Mapping[int, Any]) -> None:
+        """TerrellaError for what needs the CPU."""
+        task = type(self.task).__name__
+        lacks = ["physics that differs between worlds"] if stepped else []
+        lacks += [f"the task {task}"] if not getattr(self.task, "on_device", False) else []
+        lacks += ["the autopilot"] if self._pilot is not None else []
+        if lacks:
+            raise TerrellaError(f"{' and '.join(lacks)} of {self.name} needs the CPU; leave device out.")
 
     def varying(self, names: Sequence[str]) -> MujocoWorld:
         """The same world with these parameters differing between the worlds of a batch: see `adjusted`."""
@@ -167,13 +184,13 @@ class MujocoWorld:
                     f"the parameter '{name}' of {self.name} must be within {one.low:g} to {one.high:g} {one.unit}; got "
                     f"{float(column.min()):g} to {float(column.max()):g}."
                 )
-        return state.replace(parameters=values.double())
+        return state.replace(parameters=values.to(self.device, torch.float64))
 
     def with_joints(self, before: State, state: State, qpos: torch.Tensor, qvel: torch.Tensor) -> State:
         """`state`, the result of a step from `before`, with qpos [B, nq] and qvel [B, nv] replaced; sensors, reward and done are
         computed again."""
         physics = state["physics"].clone()
-        physics[:, self.layout.qpos], physics[:, self.layout.qvel] = qpos.double(), qvel.double()
+        physics[:, self.layout.qpos], physics[:, self.layout.qvel] = qpos.to(physics), qvel.to(physics)
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
             _, sensors, _ = self._stepper.step(physics, state["warmstart"], state["ctrl"], values, 1)
@@ -184,27 +201,31 @@ class MujocoWorld:
 
     def fingerprint(self) -> str:
         """The model, the task and the version of MuJoCo as text: worlds with the same text are the same world."""
-        return f"MuJoCo {mujoco.__version__}, {self._steps} steps a control step, {self.task}\n{self._source.to_xml()}"
+        engine = "MuJoCo Warp with " * bool(self._device)
+        return f"{engine}MuJoCo {mujoco.__version__}, {self._steps} steps a control step, {self.task}\n{self._source.to_xml()}"
 
     def start(self, batch: int, rng: torch.Generator) -> State:
         """`batch` worlds at rest, changed by the task's initialisation."""
         if batch < 1:
             raise TerrellaError(f"start needs a batch of 1 or more; got {batch}.")
-        layout, seeds = self.layout, chance.seeds(batch, rng)
-        physics = torch.zeros(batch, mujoco.mj_stateSize(self.file, _FULL), dtype=torch.float64)
-        qpos, qvel = layout.home.repeat(batch, 1), torch.zeros(batch, self.file.nv, dtype=torch.float64)
+        layout, seeds = self.layout, chance.seeds(batch, rng, self.device)
+        physics = layout.home.new_zeros(batch, mujoco.mj_stateSize(self.file, _FULL))
+        qpos, qvel = layout.home.repeat(batch, 1), physics.new_zeros(batch, self.file.nv)
         kept = self.task.initialise(layout, seeds, qpos, qvel)
         physics[:, layout.qpos], physics[:, layout.qvel] = qpos, qvel
-        physics[:, layout.qvel.stop : layout.qvel.stop + self.file.na] = torch.from_numpy(self._controls.act)
+        physics[:, layout.qvel.stop : layout.qvel.stop + self.file.na] = constant(
+            _numbers, self.device, *self._controls.act
+        )
         ctrl = layout.rest.repeat(batch, 1)
-        nominal = torch.tensor([self.parameters[name].nominal for name in self.varied], dtype=torch.float64)
+        nominal = constant(_numbers, self.device, *(float(self.parameters[name].nominal) for name in self.varied))
         values = nominal.repeat(batch, 1)
-        none = torch.zeros(batch, self.file.nv, dtype=torch.float64)
+        none = torch.zeros_like(qvel)
         with self._lock:
             _, sensors, _ = self._stepper.step(physics, none, ctrl, values, 1)  # the sensors before the first step
         held = {"physics": physics, "warmstart": none, "ctrl": ctrl, "sensors": sensors, **kept}
         held |= {"parameters": values} if self.varied else {}
-        return State({**held, "reward": torch.zeros(batch), "done": torch.zeros(batch, dtype=torch.bool)})
+        reward = torch.zeros(batch, device=self.device)
+        return State({**held, "reward": reward, "done": torch.zeros_like(reward, dtype=torch.bool)})
 
     def observe(self, observation: Mapping[str, torch.Tensor], prior: State | None, rng: torch.Generator) -> State:
         """The prior, or a start: a simulator cannot be set from an observation."""
@@ -216,8 +237,12 @@ class MujocoWorld:
         """One control step of every world that is not done."""
         if "physics" not in state or state["physics"].shape[1] != mujoco.mj_stateSize(self.file, _FULL):
             raise TerrellaError(f"this is not a state of {self.name}: {state}.")
-        ctrl = self.spec.check_action(action, state.batch).double()
         done = state["done"]
+        if self._device:
+            given = action.to(self.device) if torch.is_tensor(action) else action
+            after = self._stepped(state, self.spec.check_action(given, state.batch).to(self._dtype))
+            return after.mixed(done, state).replace(reward=after["reward"] * ~done)
+        ctrl = self.spec.check_action(action, state.batch).double()
         if done.all():
             return state.replace(reward=torch.zeros(state.batch))
         if done.any():
@@ -232,8 +257,9 @@ class MujocoWorld:
             result = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
         physics, sensors, warmstart = result
         unstable = ~(physics.isfinite().all(1) & (physics[:, self.layout.qvel].abs() < MAX_SPEED).all(1))
-        if unstable.any():
-            self._dump(state.at(unstable.nonzero()[:, 0]), action[unstable])
+        if self._device or unstable.any():
+            if not self._device:
+                self._dump(state.at(unstable.nonzero()[:, 0]), action[unstable])
             keep = {"physics": state["physics"], "sensors": state["sensors"], "warmstart": state["warmstart"]}
             physics, sensors, warmstart = (
                 torch.where(unstable[:, None], keep[name], one)
@@ -285,9 +311,9 @@ class MujocoWorld:
     def _rendered(self, state: State, names: Sequence[str]) -> dict[str, torch.Tensor]:
         """Channels that are computed world by world: pictures, poses, contacts, LiDAR."""
         rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
-        physics, ctrl = state["physics"].numpy(), state["ctrl"].numpy()
-        values = state["parameters"].numpy() if self.varied else np.zeros((state.batch, 0))
-        markers = state[MARKER].numpy() if MARKER in state else [None] * state.batch
+        physics, ctrl = (state[name].double().cpu().numpy() for name in ("physics", "ctrl"))
+        values = state["parameters"].cpu().numpy() if self.varied else np.zeros((state.batch, 0))
+        markers = state[MARKER].cpu().numpy() if MARKER in state else [None] * state.batch
         posed = [name for name in names if kind_of(name) not in SCANNED and kind_of(name) != "rgb"]
         with self._lock:
             for name in names:
@@ -306,7 +332,7 @@ class MujocoWorld:
                         rows[name].append(self._renderer.pose(camera))
                     elif kind != "rgb":
                         rows[name].append(self._renderer.measure(camera, kind))
-        return {name: torch.from_numpy(np.stack(values)) for name, values in rows.items()}
+        return {name: torch.from_numpy(np.stack(values)).to(self.device) for name, values in rows.items()}
 
     def _camera_of(self, channel: str) -> str:
         return suffix_of(channel) or (self._cameras or [""])[0]
@@ -368,7 +394,7 @@ class MujocoWorld:
 
     def _action_fields(self) -> dict[str, Any]:
         """The action fields of the Spec: the pilot's, or the actuators' controls."""
-        model, layout, pilot = self.file, self.layout, self._pilot
+        model, limits, pilot = self.file, self._controls, self._pilot
         if pilot is not None:
             high = np.array(pilot.high, np.float32)
             named = {
@@ -378,52 +404,24 @@ class MujocoWorld:
                 "action_frame": pilot.frame,
             }
             return {"action": spaces.Box(-high, high), "keys": dict(pilot.keys), "idle": (0.0,) * len(high), **named}
-        low, high = (limit.numpy().astype(np.float32) for limit in (layout.low, layout.high))
+        low, high, rest = (np.asarray(limit, np.float32) for limit in (limits.low, limits.high, limits.rest))
         return {
             "action": spaces.Box(low, high),
             "action_names": tuple(control_name(model, at) for at in range(model.nu)),
             "action_units": self._units or tuple(control_unit(model, at) for at in range(model.nu)),
             "action_mode": control_mode(model),
             "keys": self._keys,
-            "idle": tuple(layout.rest.float().tolist()),
+            "idle": tuple(rest.tolist()),
         }
+
+
+def _numbers(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def _cores() -> int:
     """The number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _home(model: mujoco.MjModel, robot: Robot | None) -> np.ndarray:
-    """qpos [nq] at rest: the robot's pose, the file's keyframe, or the reference pose with coupled joints in their places."""
-    key = home_key(model)
-    qpos = (model.qpos0 if key is None else model.key_qpos[key]).copy()
-    if robot is not None and robot.pose:
-        for at in range(model.njnt):
-            if model.jnt_type[at] not in (int(FREE), int(BALL)):
-                qpos[model.jnt_qposadr[at]] = robot.rest(model.joint(at).name)
-    elif key is None:
-        for joint, (_, offset) in ((joint, one) for group in coupled_joints(model) for joint, one in group.items()):
-            qpos[model.jnt_qposadr[joint]] += offset
-    if robot is not None and robot.height is not None:
-        qpos[2] = robot.height
-    return qpos
-
-
-def _layout(model: mujoco.MjModel, home: np.ndarray, controls: ControlLimits, steps: int) -> RobotLayout:
-    ends = 1 + model.nq, 1 + model.nq + model.nv
-    sensors = {
-        model.sensor(at).name or f"sensor{at + 1}": slice(
-            int(model.sensor_adr[at]), int(model.sensor_adr[at] + model.sensor_dim[at])
-        )
-        for at in range(model.nsensor)
-    }
-    own = (model.jnt_type != int(FREE)) & (model.jnt_type != int(BALL))
-    hinges = torch.from_numpy(model.jnt_qposadr[own]).long(), torch.from_numpy(model.jnt_dofadr[own]).long()
-    numbers_of = (home, controls.rest, controls.low, controls.high)
-    at_home, at_rest, lowest, highest = (torch.from_numpy(np.asarray(part, np.float64)) for part in numbers_of)
-    step_s = steps * float(model.opt.timestep)
-    return RobotLayout(slice(1, ends[0]), slice(*ends), hinges, at_home, at_rest, lowest, highest, sensors, step_s)
 
 
 def _cameras(model: mujoco.MjModel, wanted: Sequence[str] | None) -> list[str]:

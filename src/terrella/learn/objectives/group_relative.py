@@ -55,7 +55,7 @@ class GroupRelative:
         steps, reward = len(batch.weight), batch.reward
         advantage, weights = group_advantages(reward).flatten().repeat(steps), batch.weight.flatten()
         differ = (reward.std(1, correction=0) > _TINY).float().mean()
-        facts = {"reward": reward.mean(), "groups that differ": differ}
+        facts = {"reward": reward.mean().to(now.device), "groups that differ": differ.to(now.device)}
         used = ((weights > 0) & (advantage != 0)).nonzero()[:, 0]
         if not len(used):
             return

@@ -91,12 +91,13 @@ def _recipe(
     device = device_named(config.device)
     begun = (load_run(resume_file(Path(out), "flow"), {}, {}) or {}).get("recipe", {})  # maybe on another device
     usual = STEPS["cuda" if device.type == "cuda" else "cpu"]
-    config = replace(config, steps=config.steps or begun.get("steps") or usual)
+    minutes = minutes or config.minutes
+    config = replace(config, steps=config.steps or begun.get("steps") or usual, hours=config.limit_hours)
     dataset = Dataset(data)
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
     run = Run.of(out, config, report, device, ("hours", "learning_rate", "compile", "half"), **facts)
     settings = {"batch": config.batch, "compiled": config.compile, "half": config.half}
-    plan = TrainingPlan.of(config.preset, device, minutes or config.minutes, free_bytes(device), **settings)
+    plan = TrainingPlan.of(config.preset, device, minutes, free_bytes(device), **settings)
     plan = plan.kept(run.saved_facts("flow"))
     joined = joined_cameras(dataset, config.geometry)
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY, joined=joined)
@@ -147,7 +148,7 @@ class _Training:
         trial. Where that is more than its part of the hours, it makes fewer rollouts: a `share` of the usual number. A finished run
         stays finished until it is given more hours."""
         trainer, took_s = self.trainer, self.trainer.facts["seconds"]
-        if self.config.hours <= trainer.facts.get("asked", 0.0):
+        if self.config.limit_hours <= trainer.facts.get("asked", 0.0):
             return took_s
         budget, frames, usual_s = self.run.budget, self.config.uncertainty_frames, 0.0
         if frames:
@@ -161,7 +162,7 @@ class _Training:
         trainer, config = self.trainer, self.config
         if "senses" in trainer.facts and (self.run.out / "world" / "world.json").exists():
             return
-        trainer.facts["asked"] = config.hours
+        trainer.facts["asked"] = config.limit_hours
         trainer.save()
         world = self._save_with_strip()
         frames = int(trainer.facts.get("share", 1.0) * config.uncertainty_frames)

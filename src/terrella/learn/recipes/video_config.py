@@ -9,6 +9,7 @@ from ..presets import PresetName
 from ..recording import INSTANCES, OBJECTS, THINGS, Box, Recording, has_channel
 
 WIDTHS = (32, 56, 88, 128)  # channels of a U-Net
+USUAL_HOURS = 24.0  # of training, where none are given
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,8 @@ class TrainConfig:
     # Training steps of the generator. Training ends after these or after --hours, whichever comes first. Default: 8000 on a CPU,
     # 60000 on a GPU.
     steps: int | None = None
-    # Hours of training, of all stages together, earlier runs included; learning rates decay over them.
-    hours: float = 24.0
+    # Hours of training, of all stages together, earlier runs included; learning rates decay over them. Default: 24.
+    hours: float | None = None
     # Frames per step. Default: 8 on a CPU, 64 on a GPU.
     batch: int | None = None
     # Peak learning rate of the generator. Default: 8e-4, and without depth 6e-3.
@@ -67,7 +68,12 @@ class TrainConfig:
     @property
     def minutes(self) -> float | None:
         """Minutes of training; None where no --hours are given."""
-        return None if self.hours == TrainConfig.hours else 60 * self.hours
+        return None if self.hours is None else 60 * self.hours
+
+    @property
+    def limit_hours(self) -> float:
+        """The hours after which training ends."""
+        return USUAL_HOURS if self.hours is None else self.hours
 
 
 def video_config(recording: Recording, config: TrainConfig) -> VideoConfig:

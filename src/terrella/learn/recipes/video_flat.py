@@ -138,7 +138,7 @@ def _scrolling_of(parts: VideoParts) -> Scrolling:
     run, config = parts.run, parts.config
     scrolling = Scrolling.read(run.out, run.recipe)
     if scrolling is None or scrolling.over.shape != parts.video.size:
-        pixels = int(PAIR_PIXELS * min(1.0, max(config.hours / QUARTER, 1 / 16)))
+        pixels = int(PAIR_PIXELS * min(1.0, max(config.limit_hours / QUARTER, 1 / 16)))
         scrolling = Scrolling.of(parts.recording, config.seed, pixels)
         scrolling.write(run.out, run.recipe)
     return scrolling
