@@ -385,6 +385,28 @@ def test_missing_checkpoints_to_list_are_said(capsys, tmp_path):
     assert "nowhere" in refusal(["list", tmp_path / "nowhere"], capsys)
 
 
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
+            "the GPU has too little memory for that; give",
+        ),
+        (
+            RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 8 bytes"),
+            "this machine has too little",
+        ),
+        (MemoryError(), "this machine has too little memory"),
+    ],
+)
+def test_a_lack_of_memory_is_a_sentence(error, said, capsys, monkeypatch):
+    def lacking(*_, **__):
+        raise error
+
+    monkeypatch.setattr("terrella.library.worlds", lacking)
+    assert said in refusal(["list"], capsys)
+
+
 def test_ctrl_c_exits_with_130(capsys, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt

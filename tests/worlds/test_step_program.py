@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -71,7 +73,7 @@ def test_parts_that_share_a_tensor_are_traced_apart():
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "compiler"), [("doom-maze", "eager"), ("doom-corridor", "eager")])
 def test_bundled_worlds_compile_whole(name, compiler):
-    world = terrella.load(name)
+    world: Any = terrella.load(name)
     steps = StepPrograms(world, compiler)
     mine, program = walk(world, world.advance, 1, 2), walk(world, steps, 1, 2)
     assert steps.programs[1].way == f"torch.compile ({compiler})"
@@ -85,6 +87,16 @@ def test_an_arena_that_grows_is_no_other_world():
     with tensor_programs():
         forks = [walk(world, steps, 1, 2) for _ in range(step_program.ROOM * 3)]
     assert all(forks[0] == fork for fork in forks[1:])
+
+
+def test_where_a_step_cannot_be_captured_it_runs_as_it_is(monkeypatch):
+    def failing(run, inputs):
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
+
+    monkeypatch.setattr(step_program, "captured", failing)
+    with pytest.warns(UserWarning, match=r"CUDA graphs fail here \(CUDA out of memory.\); steps run kernel by kernel"):
+        run, way = step_program.with_graph(list, [], "traced")
+    assert (run, way) == (list, "traced")
 
 
 def test_without_a_compiler_a_step_runs_as_it_is(monkeypatch):

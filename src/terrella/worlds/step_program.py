@@ -84,7 +84,7 @@ class StepPrograms:
         graph, after = traced(self.world, state, inputs)
         run, way = compiled(graph, inputs, self.compiler)
         if state.device.type == "cuda":
-            run, way = captured(run, inputs), f"{way}, captured as a CUDA graph"
+            run, way = with_graph(run, inputs, way)
         rooms = {name: arena.capacity for name, arena in state.arenas.items()}
         return StepProgram(tuple(sorted(state)), after, rooms, graph, run, way)
 
@@ -121,6 +121,16 @@ def compiled(graph: torch.fx.GraphModule, inputs: list[torch.Tensor], compiler: 
         warnings.warn(f"torch.compile fails here ({reason}); steps run uncompiled.", stacklevel=2)
         return graph, "traced"
     return run, f"torch.compile ({compiler})"
+
+
+def with_graph(run: Run, inputs: list[torch.Tensor], way: str) -> tuple[Run, str]:
+    """`run` as a CUDA graph, and how it runs then. Where that fails it stays as it is, with a warning."""
+    try:
+        return captured(run, inputs), f"{way}, captured as a CUDA graph"
+    except RuntimeError as error:  # of the driver, or for lack of memory
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        warnings.warn(f"CUDA graphs fail here ({reason}); steps run kernel by kernel.", stacklevel=2)
+        return run, way
 
 
 def captured(run: Run, inputs: list[torch.Tensor]) -> Run:
