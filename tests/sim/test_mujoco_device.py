@@ -103,7 +103,8 @@ def test_what_needs_the_cpu_is_refused_by_name(single):
         ("drone", {}, "the autopilot of mujoco:drone needs the CPU; leave device out"),
         ("car:road", {}, "the task Driving"),
         ("hopper", {"parameters": ("gravity",)}, "physics that differs between worlds"),
-        ("hopper", {"device": "nonsense"}, "there is no device 'nonsense'; give cuda or cuda:1"),
+        ("hopper", {"device": "nonsense"}, "PyTorch has no device 'nonsense' here; give cuda or cuda:1"),
+        ("hopper", {"device": "cuda:99"}, "PyTorch has no device 'cuda:99' here"),
     ):
         with pytest.raises(TerrellaError, match=lack):
             load(f"mujoco:{name}", **{"device": ON_CPU, "cameras": (), **options})

@@ -19,9 +19,13 @@ BATCHES = 4  # sizes of batches whose arrays are kept
 def torch_device(name: str) -> torch.device:
     """Where states lie that are stepped on a device of MujocoConfig; TerrellaError for no device."""
     try:
-        return torch.device("cpu" if name in ("", ON_CPU) else name)
-    except RuntimeError as error:
-        raise TerrellaError(f"there is no device '{name}'; give cuda or cuda:1, or leave `device` out.") from error
+        device = torch.device("cpu" if name in ("", ON_CPU) else name)
+        torch.zeros(1, device=device)
+        return device
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise TerrellaError(
+            f"PyTorch has no device '{name}' here; give cuda or cuda:1 where it has one, or leave `device` out."
+        ) from error
 
 
 class WarpStepper(Stepper):
