@@ -20,6 +20,7 @@ from terrella.learn.objectives.lawful import LawLoss
 from terrella.learn.recipes.adapt import AdaptConfig, _fitting, adapt, errors_on
 from terrella.learn.recipes.latent import LatentTraining, train_latent
 from terrella.learn.rehearsal import joined
+from terrella.worlds.folder import load_latent
 
 from ..data.layouts import layout_of
 
@@ -49,7 +50,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("adapt")
     old, new = drifting(folder / "old"), heavier(folder / "new")
     train_latent(old, folder / "run", replace(QUICK, latent=None, steps=160), quiet)
-    return terrella.load(folder / "run"), old, new
+    return load_latent(folder / "run" / "world"), old, new
 
 
 def test_it_learns_the_other_body_and_forgets_less_where_it_rehearses(made, tmp_path):
@@ -59,7 +60,7 @@ def test_it_learns_the_other_body_and_forgets_less_where_it_rehearses(made, tmp_
     errors = with_old["errors"]
     assert errors["new"]["before"]["8"] > 0.9 and errors["new"]["after"]["8"] < 0.6 * errors["new"]["before"]["8"]
     assert without["errors"]["new"]["after"]["8"] < 0.6 * errors["new"]["before"]["8"]
-    forgotten = errors_on(terrella.load(tmp_path / "bare"), _fitting(world, old, quiet))
+    forgotten = errors_on(load_latent(tmp_path / "bare" / "world"), _fitting(world, old, quiet))
     assert errors["old"]["after"]["8"] < forgotten["8"]
     assert "not measured" in without["verdict"] and "On the old one" in with_old["verdict"]
     assert adapt(world, new, tmp_path / "kept", SHORT, quiet, old)["errors"] == errors  # finished: as it was
@@ -67,7 +68,7 @@ def test_it_learns_the_other_body_and_forgets_less_where_it_rehearses(made, tmp_
 
 def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
     world, old, new = made
-    with pytest.raises(TrainingError, match="doom-maze is no latent world"):
+    with pytest.raises(TrainingError, match="doom-maze is a world with depth and poses"):
         adapt(terrella.load("doom-maze"), new, tmp_path / "run", SHORT, quiet)
     with pytest.raises(TrainingError, match="--minutes is more than 0"):
         adapt(world, new, tmp_path / "run", AdaptConfig(minutes=0), quiet)
@@ -94,7 +95,7 @@ def test_laws_are_a_part_of_the_loss_where_the_recording_describes_its_bodies(ma
     terrella.collect("physics:parabola", config)
     few = LatentTraining(steps=2, batch=8, rollout=4, leap=0, strip_every_s=1e9)
     train_latent(tmp_path / "balls", tmp_path / "run", few, quiet)
-    world = terrella.load(tmp_path / "run")
+    world = load_latent(tmp_path / "run" / "world")
     recording = _fitting(world, tmp_path / "balls", quiet)
     laws = LawLoss.of(recording, world.network, 4)
     assert laws is not None and LawLoss.of(_fitting(made[0], made[1], quiet), made[0].network, 4) is None
@@ -131,4 +132,4 @@ def test_the_command_says_what_was_gained_and_what_was_forgotten(made, tmp_path,
     assert f"next: terrella train policy --out {out}-policy --in {out}" in said  # without pictures it cannot be played
     assert said.startswith("After 16 steps its error on the new recording is") and "On the old one it is" in said
     assert main(["adapt", "doom-maze", "--from", str(new), "--out", out]) == 2
-    assert "is no latent world" in capsys.readouterr().err
+    assert "is a world with depth and poses" in capsys.readouterr().err

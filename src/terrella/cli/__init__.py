@@ -45,7 +45,7 @@ COMMANDS = {
     "skills list": ("skills:list_", "list the skills of a library"),
     "skills rename": ("skills:rename", "give a skill another name"),
     "skills try": ("skills:try_", "try a skill in an environment, and count how often it works"),
-    "adapt": ("train:adapt", "adapt a latent world to another body or camera, on a recording of minutes"),
+    "adapt": ("train:adapt", "adapt a world to another body or camera, on a recording of minutes"),
     "train goals": ("train:goals", "train a policy that reaches goals in a latent world, without a search"),
     "train estimator": (
         "train:estimator",

@@ -80,17 +80,18 @@ def adapt(
     keep: Annotated[str | None, arg(metavar="RECORDING")] = None,
     json: Json = False,
 ) -> None:
-    """Adapt a latent world to another body or camera: it goes on learning on a recording of minutes. Stop it with Ctrl-C at any
-    time; the same command continues.
+    """Adapt a world to another body or camera: it goes on learning on a recording of minutes. Stop it with Ctrl-C at any time; the
+    same command continues.
 
     Args:
-        name: The latent world: a run of `train latent`, or its folder.
+        name: A latent world, or one of frames alone: a run of `train latent` or `train video`, or its folder.
         data: A recording of the other body or camera, with the same channels and as many actions.
         out: Folder of the run; the adapted world is in OUT/world.
         keep: A recording that the world was trained on. Half of each batch is of it, so that less is forgotten, and how much is
             forgotten is measured.
     """
-    show(adapt_world(name, data, out, config, keep=keep, progress=say), json, _practising(out, data))
+    result = adapt_world(name, data, out, config, keep=keep, progress=say)
+    show(result, json, _practising(out, data) if result.facts["latent"] else _playing(out))
 
 
 def estimator(data: RecordingName, out: str, config: EstimatorTraining, json: Json = False) -> None:

@@ -15,13 +15,14 @@ Clips = TypeVar("Clips")
 
 
 class Rehearsal:
-    """Each batch is one of `new` and one of `kept`, joined: instances of one dataclass of tensors."""
+    """Each batch is one of `new` and one of `kept`, joined: instances of one dataclass of tensors. interleaved: their rows in
+    turn, for objectives that treat the first rows of a batch otherwise."""
 
-    def __init__(self, new: Feed, kept: Feed):
-        self.new, self.kept = new, kept
+    def __init__(self, new: Feed, kept: Feed, interleaved: bool = False):
+        self.new, self.kept, self.interleaved = new, kept, interleaved
 
     def batch(self, now: TrainStep) -> object:
-        return joined(self.new.batch(now), self.kept.batch(now))
+        return joined(self.new.batch(now), self.kept.batch(now), self.interleaved)
 
     def state(self) -> dict:
         return {"new": self.new.state(), "kept": self.kept.state()}
@@ -31,10 +32,13 @@ class Rehearsal:
         self.kept.resume(state["kept"])
 
 
-def joined(one: Clips, other: Clips) -> Clips:
+def joined(one: Clips, other: Clips, interleaved: bool = False) -> Clips:
     """The rows of both; a field that one of them lacks is None."""
     parts = {}
     for name in (part.name for part in fields(one)):  # type: ignore[arg-type]
         both = getattr(one, name), getattr(other, name)
-        parts[name] = None if any(part is None for part in both) else torch.cat(both)
+        if any(part is None for part in both):
+            parts[name] = None
+        else:
+            parts[name] = torch.stack(both, 1).flatten(0, 1) if interleaved else torch.cat(both)
     return type(one)(**parts)

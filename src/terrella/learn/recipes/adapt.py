@@ -1,19 +1,23 @@
-"""adapt: a latent world goes on learning, on a recording of another body or camera, beside what it learned before."""
+"""adapt: a world goes on learning, on a recording of another body or camera, beside what it learned before."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.errors import DatasetError, TrainingError
 from ...core.world import World
 from ...worlds.folder import load_latent
 from ...worlds.latent import LatentWorld
+from ...worlds.learned import LearnedWorld
 from ..latent_validation import ARMS, HORIZONS, open_loop
 from ..recording import Recording
 from ..trainer import Report
+from .adapt_frames import adapt_frames, settings_of
 from .latent import Beginning, LatentTraining, open_rows, train_latent, vectors_of
+
+LATENT_RATE, FRAMES_RATE = 5e-4, 3e-3  # peak learning rates
 
 
 @dataclass(frozen=True)
@@ -21,10 +25,12 @@ class AdaptConfig:
     """Settings of `adapt`."""
 
     minutes: float = 10.0  # Minutes of training, earlier runs included.
-    # Training steps. Training ends after these or after --minutes, whichever comes first. Default: 4000, and with pictures 2500.
+    # Training steps. Training ends after these or after --minutes, whichever comes first. Default: 4000, with pictures 2500, of a
+    # world that draws frames 8000.
     steps: int | None = None
-    learning_rate: float = 5e-4  # Peak learning rate.
-    # Clips per step; with --keep half of them are of that recording. Default: 128, and with pictures 32.
+    # Peak learning rate. Default: 5e-4, of a world that draws frames 3e-3.
+    learning_rate: float | None = None
+    # Clips per step; with --keep half of them are of that recording. Default: 128, with pictures 32, of frames 8.
     batch: int | None = None
     # --no-laws: leave the laws of physics out of the loss. They are a part of it where the recording describes its bodies.
     laws: bool = True
@@ -35,17 +41,24 @@ class AdaptConfig:
 def adapt(
     world: World, data: str | Path, out: str | Path, config: AdaptConfig, report: Report, keep: str | Path | None = None
 ) -> dict:
-    """Trains, or resumes, a copy of a latent world on the recording `data`; `out`/world is the result. keep: a recording of what it
-    learned before, of which half of each batch is made. Returns facts, the verdict first; `errors` has, of each recording, the
-    world's open-loop error on held-out episodes by step, before and after, as a share of copy-last's. TrainingError for a world
-    that cannot go on learning; DatasetError for a recording with other channels or actions."""
-    if not isinstance(world, LatentWorld):
-        raise TrainingError(
-            f"{world.spec.name} is no latent world (`terrella train latent`), and only these adapt; of worlds with depth and poses "
-            "`terrella train dreams` continues the training."
-        )
+    """Trains, or resumes, a copy of a latent world, or of a world of frames alone, on the recording `data`; `out`/world is the
+    result. keep: a recording of what it learned before, of which half of each batch is made. Returns facts, the verdict first;
+    `errors` has, of each recording, the world's open-loop error on held-out episodes by step, before and after, as a share of
+    copy-last's: of latents, or the squared error of frames. TrainingError for a world that cannot go on learning; DatasetError for
+    a recording with other channels or actions."""
     if config.minutes <= 0 or (config.steps is not None and config.steps < 1):
         raise TrainingError("--minutes is more than 0, and --steps 1 or more.")
+    if isinstance(world, LearnedWorld):
+        settings = replace(
+            settings_of(world), hours=config.minutes / 60, steps=config.steps, batch=config.batch, seed=config.seed,
+            learning_rate=config.learning_rate or FRAMES_RATE, device=config.device,
+        )  # fmt: skip
+        facts, errors = adapt_frames(world, data, out, settings, report, keep)
+        return {**facts, "latent": False, "verdict": verdict(errors), "errors": errors}
+    if not isinstance(world, LatentWorld):
+        raise TrainingError(
+            f"{world.spec.name} is no learned world, and only these adapt: give a run of `terrella train`."
+        )
     shape = world.network.config
     new, old = (_fitting(world, one, report) if one is not None else None for one in (data, keep))
     assert new is not None
@@ -53,14 +66,14 @@ def adapt(
     settings = LatentTraining(
         world.spec.name, shape.sees_pictures, shape.sees_vectors, tuple(name for name, _ in shape.vectors), shape.size,
         history=shape.history, frames=shape.frames, hidden=shape.hidden, members=shape.members, leap=shape.leap,
-        steps=config.steps, hours=config.minutes / 60, batch=config.batch, learning_rate=config.learning_rate,
+        steps=config.steps, hours=config.minutes / 60, batch=config.batch, learning_rate=config.learning_rate or LATENT_RATE,
         seed=config.seed, device=config.device,
     )  # fmt: skip
     facts = train_latent(data, out, settings, report, begin=Beginning(world, old, config.laws))
     adapted = load_latent(facts["world"])
     after = {name: errors_on(adapted, one) for name, one in (("new", new), ("old", old)) if one is not None}
     errors = {name: {"before": before[name], "after": after[name]} for name in before}
-    return {**facts, "verdict": verdict(errors), "errors": errors}
+    return {**facts, "latent": True, "verdict": verdict(errors), "errors": errors}
 
 
 def _fitting(world: LatentWorld, data: str | Path, report: Report) -> Recording:

@@ -18,6 +18,7 @@ from ...worlds.learned import LearnedWorld
 from ..budget import Stage
 from ..devices import describe_device, device_named, free_bytes
 from ..objectives.uncertainty import discard_uncertainty, uncertainty_seconds
+from ..paired import fingerprint
 from ..presets import STEPS, TrainingPlan
 from ..recording import Recording, joined_cameras
 from ..run_folder import load_run, resume_file
@@ -26,7 +27,7 @@ from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
-from .video_flat import FlowRecipe
+from .video_flat import FlowBeginning, FlowRecipe
 from .video_parts import VideoRecipe
 from .video_posed import PosedRecipe
 
@@ -41,10 +42,11 @@ def train_video(
     report: Report,
     paced: Paced | None = None,
     say: Callable[[str], object] = lambda line: None,
+    begin: FlowBeginning | None = None,
 ) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
-    `Trainer.train`, of the generator's steps. `say` is given a sentence of what is about to be trained."""
-    recipe = _recipe(data, out, config, report)
+    `Trainer.train`, of the generator's steps. `say` is given a sentence of what is about to be trained. `begin`: see `adapt`."""
+    recipe = _recipe(data, out, config, report, begin=begin)
     say(recipe.plan.sentence(describe_device(str(recipe.plan.device)), recipe.channels))
     return _Training(recipe, paced).learn()
 
@@ -82,7 +84,12 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
 
 
 def _recipe(
-    data: str | Path, out: str | Path, config: TrainConfig, report: Report, minutes: float | None = None
+    data: str | Path,
+    out: str | Path,
+    config: TrainConfig,
+    report: Report,
+    minutes: float | None = None,
+    begin: FlowBeginning | None = None,
 ) -> VideoRecipe:
     """What is learned from the recording, by a preset for `minutes`, by default those of the settings. TrainingError or
     DatasetError for settings and recordings that do not fit."""
@@ -95,6 +102,9 @@ def _recipe(
     config = replace(config, steps=config.steps or begun.get("steps") or usual, hours=config.limit_hours)
     dataset = Dataset(data)
     facts = {"frames": dataset.length, "recording of": dataset.world.get("name")}
+    if begin is not None:
+        kept = begin.kept.cache.length if begin.kept else 0
+        facts |= {"begins with": fingerprint(begin.world.generator), "keeps": kept}
     run = Run.of(out, config, report, device, ("hours", "learning_rate", "compile", "half"), **facts)
     settings = {"batch": config.batch, "compiled": config.compile, "half": config.half}
     plan = TrainingPlan.of(config.preset, device, minutes, free_bytes(device), **settings)
@@ -103,7 +113,9 @@ def _recipe(
     recording = Recording.open(dataset, config.size, report, needs=("rgb", "action"), why=WHY, joined=joined)
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
-    return (PosedRecipe if video.geometry else FlowRecipe)(run, recording, config, video, plan)
+    if video.geometry:
+        return PosedRecipe(run, recording, config, video, plan)
+    return FlowRecipe(run, recording, config, video, plan, begin)
 
 
 class _Training:

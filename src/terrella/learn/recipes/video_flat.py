@@ -1,7 +1,7 @@
 """Worlds of frames alone: recordings without depth or poses. Stages: scroll, outcome, then a flow network."""
 
 import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,16 +16,17 @@ from ...worlds.controls import Controls
 from ...worlds.flow import FlowConfig, FlowNetwork, carry
 from ...worlds.frame_history import FrameHistory, StartClips
 from ...worlds.learned import LearnedWorld
-from ...worlds.outcome import ConstantConfig
+from ...worlds.outcome import ConstantConfig, FrameOutcome
 from ..budget import Stage
 from ..device_clips import ROOM, DeviceClips, DeviceGrounds, bytes_of
 from ..devices import free_bytes
 from ..feeds import ClipStream, clips_of, fitting_rollout
-from ..moves import Scrolling, changed_pixels, mosaics, stitch_episodes
+from ..moves import Scrolling, StitchedEpisodes, changed_pixels, mosaics, stitch_episodes
 from ..objectives.flow_frames import FlowClipMaker, FlowFrames
 from ..objectives.scroll import learn_scroll
 from ..presets import GIB, TrainingPlan
 from ..recording import Recording
+from ..rehearsal import Rehearsal
 from ..run_folder import resume_file
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
@@ -42,11 +43,28 @@ CHANGED_SHARE, MAX_STRESS = (
 )  # pixels that change are weighted up to this share of the loss, at most by this factor
 
 
+@dataclass(frozen=True)
+class FlowBeginning:
+    """What a training continues: a finished world of frames alone, and a recording of what it learned before, if there is one."""
+
+    world: LearnedWorld
+    kept: Recording | None = None
+
+
 class FlowRecipe:
     """A flow network: each frame is a sample of what may follow the last frames, with the mosaic as memory where pictures
     scroll."""
 
-    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig, plan: TrainingPlan):
+    def __init__(
+        self,
+        run: Run,
+        recording: Recording,
+        config: TrainConfig,
+        video: VideoConfig,
+        plan: TrainingPlan,
+        begin: FlowBeginning | None = None,
+    ):
+        self.begin = begin
         self.channels = config.channels
         if config.keep_out is not None:
             raise DatasetError(
@@ -59,20 +77,16 @@ class FlowRecipe:
             raise TrainingError("--channels: a flow network has three, each a multiple of 8, as 64 112 160.")
         if self.video.slots < 2:
             raise TrainingError("--frames 1: how things move is seen in two frames; give 2 or more.")
-        scrolling, plain = _scrolling_of(self.parts), self.video.generator
-        moves, self.over = scrolling.moves, scrolling.over
-        steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
-        views = tuple(MountedCamera(lens.intrinsics, lens.mount) for lens in recording.lenses().values())
-        settings = FlowConfig(plain.size, plain.slots, plain.context, len(moves) - 1, widths, steps)
-        mounted = len(views) == len(recording.cameras)  # it is known of each how it is mounted
-        network = FlowNetwork(replace(settings, views=views) if mounted else settings)
-        network.moves[:], network.over[:] = moves, self.over
+        network, plain = self._network(widths), self.video.generator
+        moves, self.over = network.moves.clone(), network.over.clone()
         lengths = np.array([np.diff(recording.cache.episodes[number])[0] for number in recording.seen] or [0])
         rollout, stress = (
             fitting_rollout(lengths, plain.slots, FLOW_ROLLOUT),
             stress_of(recording, network, config.seed),
         )
         self.objective = FlowFrames(network, config.learning_rate or 6e-3, rollout, stress)
+        if begin is not None and network.scrolling is not None:
+            self.objective.freeze_scroll()
         if plan.compiled:
             self.objective.compile()
         self.stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
@@ -81,10 +95,33 @@ class FlowRecipe:
         self.held, where = self._on_device(free_bytes(run.device))
         self.plan = replace(plan, recording=where)
 
+    def _network(self, widths: tuple[int, ...]) -> FlowNetwork:
+        """A new network for the recording, or a copy of the one that the training continues."""
+        if self.begin is not None:
+            generator = self.begin.world.generator
+            assert isinstance(generator, FlowNetwork)
+            self._continue_outcome(self.begin.world)
+            return copy.deepcopy(generator).to(self.parts.run.device).train().requires_grad_(True)
+        recording, plain, config = self.parts.recording, self.video.generator, self.parts.config
+        scrolling = _scrolling_of(self.parts)
+        steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
+        views = tuple(MountedCamera(lens.intrinsics, lens.mount) for lens in recording.lenses().values())
+        settings = FlowConfig(plain.size, plain.slots, plain.context, len(scrolling.moves) - 1, widths, steps)
+        mounted = len(views) == len(recording.cameras)  # it is known of each how it is mounted
+        network = FlowNetwork(replace(settings, views=views) if mounted else settings)
+        network.moves[:], network.over[:] = scrolling.moves, scrolling.over
+        return network
+
+    def _continue_outcome(self, world: LearnedWorld) -> None:
+        """The model of rewards and ends goes on from that of the world, where both predict the same."""
+        mine, theirs = self.parts.outcome, world.parts.get("outcome")
+        if mine is not None and isinstance(theirs, FrameOutcome) and mine.config == theirs.config:
+            mine.load_state_dict(theirs.state_dict())
+
     def _on_device(self, free_bytes: float) -> tuple[DeviceClips | None, str]:
         """The recording on a GPU with as many bytes free, if there is room for it, and a sentence of that."""
         device, recording = self.parts.run.device, self.parts.recording
-        if device.type != "cuda":
+        if device.type != "cuda" or (self.begin is not None and self.begin.kept is not None):
             return None, ""
         size = bytes_of(recording, self.stitched)
         if size > ROOM * free_bytes:
@@ -98,16 +135,24 @@ class FlowRecipe:
 
     def feed(self, batch: int) -> Feed:
         """Clips chosen from three times as many, preferring those that change more; on a GPU from all, which lie there."""
-        recording, slots = self.parts.recording, self.video.slots
-        controls = recording.controls or Controls.buttons(self.video.actions)
-        length, seed = slots + self.objective.losses_per_batch, self.parts.config.seed
         if self.held is not None:
             return self.held.sized(2 * batch)
-        maker = FlowClipMaker(controls, slots, 2 * batch, self.stitched, self.over)
-        return ClipStream(clips_of(recording, length, 3 * maker.batch, self.video, seed), maker)
+        if self.begin is None or self.begin.kept is None:
+            return self._clips(self.parts.recording, self.stitched, 2 * batch)
+        kept, moves = self.begin.kept, self.objective.generator.moves.cpu()
+        stitched = stitch_episodes(kept, moves, self.over) if len(moves) > 1 else None
+        streams = self._clips(self.parts.recording, self.stitched, batch), self._clips(kept, stitched, batch)
+        return Rehearsal(*streams, interleaved=True)
+
+    def _clips(self, recording: Recording, stitched: StitchedEpisodes | None, batch: int) -> Feed:
+        slots, seed = self.video.slots, self.parts.config.seed
+        controls = recording.controls or Controls.buttons(self.video.actions)
+        maker = FlowClipMaker(controls, slots, batch, stitched, self.over)
+        length = slots + self.objective.losses_per_batch
+        return ClipStream(clips_of(recording, length, 3 * batch, self.video, seed), maker)
 
     def preparations(self) -> list[Stage]:
-        scrolls = [Stage("scroll", 0.1, self._learn_scroll)] if self.stitched is not None else []
+        scrolls = [Stage("scroll", 0.1, self._learn_scroll)] if self.stitched is not None and self.begin is None else []
         return [*scrolls, *self.parts.outcome_stages()]
 
     def _learn_scroll(self) -> None:
