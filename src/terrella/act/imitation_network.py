@@ -90,11 +90,10 @@ class _Look(nn.Module):
         self.picture, self.size = is_picture(shape), size
         channels = shape[2]
         if self.picture:
-            widths = (channels, 16, 32, 48)
+            last, cells = 48, CELLS**2 + 2
             self.first = nn.Sequential(
-                *[part for a, b in zip(widths, widths[1:]) for part in (nn.Conv2d(a, b, 4, 2, 1), nn.ReLU())]
+                nn.Conv2d(channels, 24, 4, 2, 1), nn.ReLU(), nn.Conv2d(24, last, 4, 2, 1), nn.ReLU()
             )
-            last, cells = 48, CELLS**2
         else:
             self.codes = nn.Embedding(channels * CODES, 32)
             self.register_buffer("offset", torch.arange(channels) * CODES, persistent=False)
@@ -115,8 +114,17 @@ class _Look(nn.Module):
             scale, shift = self.film(words)[..., None, None].chunk(2, 1)
             features = torch.relu((1 + scale) * features + shift)
         features = self.second(features)
-        features = F.adaptive_avg_pool2d(features, CELLS) if self.picture else features
-        return torch.relu(self.out(features.flatten(1)))
+        if not self.picture:
+            return torch.relu(self.out(features.flatten(1)))
+        pooled = F.adaptive_avg_pool2d(features, CELLS)
+        return torch.relu(self.out(torch.cat([pooled.flatten(1), spatial_softmax(features)], 1)))
+
+
+def spatial_softmax(features: torch.Tensor) -> torch.Tensor:
+    """Where each map of [N, C, H, W] is largest, softly: x and y from -1 to 1, [N, 2C] (Levine et al. 2016)."""
+    weights = features.flatten(2).softmax(2).view_as(features)
+    y, x = (torch.linspace(-1, 1, side, device=features.device) for side in features.shape[2:])
+    return torch.cat([(weights.sum(2) * x).sum(2), (weights.sum(3) * y).sum(2)], 1)
 
 
 def _deviation(numbers: torch.Tensor) -> torch.Tensor:

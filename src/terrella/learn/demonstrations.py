@@ -9,6 +9,7 @@ import torch
 
 from ..act.imitation_network import ImitationConfig
 from ..act.sentences import WordEncoder
+from ..act.teacher import EXPERT
 from ..core.errors import DatasetError
 from ..data.training.cache import array_for
 from .objectives.imitation import Demonstrations
@@ -27,10 +28,11 @@ class DemonstrationRows:
     rows: np.ndarray  # that are sampled
     valid: np.ndarray  # bool [R]: rows with an action
     stop: np.ndarray  # [R]: the end of each row's episode
-    actions: torch.Tensor  # float32 [R, A], encoded
+    actions: torch.Tensor  # float32 [R, A], encoded, that are imitated
     words: torch.Tensor | None  # int64 [R, WORDS], the instruction of each row
     outcome: torch.Tensor | None  # float32 [R], the standardised return of each row's episode
     weight: torch.Tensor | None = None  # float32 [R], of each row's action in the loss; None: 1
+    taken: torch.Tensor | None = None  # float32 [R, A], encoded, that were taken; None: those that are imitated
     ahead: int = 0  # observations after the moment that are seen, too, as the last of the history
 
     @staticmethod
@@ -58,6 +60,19 @@ class DemonstrationRows:
             raise DatasetError(f"{recording.name} holds no actions to imitate; record demonstrations.")
         weight = None if sure is None else torch.from_numpy(np.array(sure, np.float32).reshape(-1))
         return DemonstrationRows(recording, config, device, rows, valid, stop, actions, words, outcome, weight)
+
+    @property
+    def advised(self) -> DemonstrationRows:
+        """The same with the actions of a recorded teacher in the place of those that were taken, which may be noisy, or those of a
+        policy that errs (DAgger, Ross et al. 2011); itself where the recording has no channel `expert` of actions."""
+        cache, controls = self.recording.cache, self.recording.controls
+        array = array_for(EXPERT, cache.arrays, cache.keys)
+        if array is None or controls is None:
+            return self
+        expert = torch.from_numpy(np.array(cache.arrays[array], np.float32)).flatten(1)
+        if expert.shape[1] != len(controls.low):
+            return self
+        return replace(self, actions=controls.encode(expert), taken=self.actions)
 
     @property
     def held_out(self) -> DemonstrationRows:
@@ -124,7 +139,8 @@ class DemonstrationRows:
         instructions of the rows `spoken`."""
         config, start, seen = self.config, self.recording.start[rows], self.observations(shown)
         before = torch.from_numpy((back - 1).clip(start[:, None], self.stop[rows][:, None] - 1))
-        acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], self.actions[before], 0.0)
+        taken = self.actions if self.taken is None else self.taken
+        acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], taken[before], 0.0)
         ahead = rows[:, None] + np.arange(config.chunk)
         valid = torch.from_numpy(ahead < self.stop[rows][:, None])
         ahead = np.minimum(ahead, self.stop[rows][:, None] - 1)

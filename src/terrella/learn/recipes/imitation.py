@@ -74,11 +74,12 @@ def train_imitation(
     imitation: Imitation,
     report: Report,
     device: str = "auto",
-    relabel: Callable[[DemonstrationRows], DemonstrationRows] = lambda rows: rows,
+    relabel: Callable[[DemonstrationRows], DemonstrationRows] = lambda rows: rows.advised,
     spec: Spec | None = None,
 ) -> dict[str, Any]:
     """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
-    verdict on held-out episodes. relabel: which rows are learned from, with what actions. spec: where it is to act. DatasetError
+    verdict on held-out episodes. relabel: which rows are learned from, with what
+    actions; default: a recorded teacher's (channel `expert`), else those that were taken. spec: where it is to act. DatasetError
     or TrainingError for what cannot be imitated, ActionError or ChannelError if it could not act there."""
     out, batch = Path(out), practice.batch or 256
     _check(practice, imitation)
@@ -97,7 +98,12 @@ def train_imitation(
     feed = SizedFeed(lambda size: RandomBatches(lambda now: rows.sample(size, now.rng)), batch)
     trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
     trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
-    card = {"what": f"A policy that imitates {recording}", "learned_from": str(recording), "sees": list(sees)}
+    whose = "the teacher (channel 'expert') at what happens in" if rows.taken is not None else ""
+    card = {
+        "what": " ".join(f"A policy that imitates {whose} {recording}".split()),
+        "learned_from": str(recording),
+        "sees": list(sees),
+    }
 
     def save() -> None:
         ImitationActor.write(network, out / RUN_SUBFOLDER, card)
