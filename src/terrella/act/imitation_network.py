@@ -20,6 +20,7 @@ TEXT = "text"
 LEAST_PICTURE_SIDE = 16  # pixels: smaller arrays [H, W, C] are codes of cells, as those of MiniGrid
 CODES = 32  # values of a code
 CELLS = 4  # side of the pooled feature map of a picture
+QUERIES = 4  # places of a picture to which an instruction attends
 FLOW_STEPS = 8  # Euler steps from noise to a chunk
 
 
@@ -81,7 +82,8 @@ def is_picture(shape: tuple[int, ...]) -> bool:
 
 
 class _Look(nn.Module):
-    """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018)."""
+    """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018). Of
+    a picture also where each map is largest, and where the instruction's queries attend to."""
 
     offset: torch.Tensor
 
@@ -100,8 +102,9 @@ class _Look(nn.Module):
             self.first = nn.Sequential(nn.Conv2d(32, 32, 3, 1, 1), nn.ReLU())
             last, cells = 32, shape[0] * shape[1]
         self.film = nn.Linear(words, 2 * last) if words else None
-        self.second = nn.Sequential(nn.Conv2d(last, last, 3, 1, 1), nn.ReLU())
-        self.out = nn.Linear(last * cells, width)
+        self.second = nn.Conv2d(last, last, 3, 1, 1)
+        self.queries = nn.Linear(words, QUERIES * last) if words and self.picture else None
+        self.out = nn.Linear(last * cells + 2 * QUERIES * (self.queries is not None), width)
 
     def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
         if self.picture:
@@ -113,11 +116,15 @@ class _Look(nn.Module):
         if self.film is not None and words is not None:
             scale, shift = self.film(words)[..., None, None].chunk(2, 1)
             features = torch.relu((1 + scale) * features + shift)
-        features = self.second(features)
+        maps = self.second(features)
+        features = torch.relu(maps)
         if not self.picture:
             return torch.relu(self.out(features.flatten(1)))
-        pooled = F.adaptive_avg_pool2d(features, CELLS)
-        return torch.relu(self.out(torch.cat([pooled.flatten(1), spatial_softmax(features)], 1)))
+        parts = [F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)]
+        if self.queries is not None and words is not None:
+            queries = self.queries(words).unflatten(1, (QUERIES, -1))
+            parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, maps)))
+        return torch.relu(self.out(torch.cat(parts, 1)))
 
 
 def spatial_softmax(features: torch.Tensor) -> torch.Tensor:

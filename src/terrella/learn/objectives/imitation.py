@@ -1,6 +1,7 @@
 """Behaviour cloning of chunks of actions (ACT, Zhao et al. 2023): cross-entropy for choices and buttons, flow matching for axes."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +16,9 @@ from ..trainer import Loss
 FORGOTTEN = (
     0.5  # probability that the own actions are hidden, so that the policy is no copy of them (de Haan et al. 2019)
 )
-SHIFT = 4  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et al. 2020)
+FULL = nullcontext()
+DRAWS = 8  # of noise and flow time for each moment: a look at pictures costs far more than the flow
+SHIFT = 2  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et al. 2020)
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,13 @@ class BehaviourCloning:
     def losses(self, batch: Demonstrations, now: TrainStep) -> Iterator[Loss]:
         network, config, count = self.network, self.network.config, len(batch.chunk)
         hidden = torch.from_numpy(now.rng.random(count) < FORGOTTEN).to(batch.acted.device)
-        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now))
+        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now), now.half())
         if config.actor.mode == AXES:
-            data = batch.chunk.flatten(1)
-            time, noise = now.rand(count), now.randn(*data.shape)
+            data, out = batch.chunk.flatten(1).repeat(DRAWS, 1), out.repeat(DRAWS, 1)
+            time, noise = now.rand(len(data)), now.randn(*data.shape)
             noisy = torch.lerp(noise, data, time[:, None])
-            error = (network.flow(noisy, time, out) - (data - noise)).square().view(*batch.chunk.shape).mean(2)
+            errors = (network.flow(noisy, time, out) - (data - noise)).square()
+            error = errors.view(DRAWS, *batch.chunk.shape).mean((0, 3))
         else:
             error = chunk_errors(network, out, batch.chunk)
         loss = (error * batch.weight).sum() / batch.weight.sum().clamp_min(1e-6)
@@ -56,16 +60,22 @@ class BehaviourCloning:
 
 
 def condition(
-    network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor, shift: tuple[int, int] = (0, 0)
+    network: ImitationNetwork,
+    batch: Demonstrations,
+    acted: torch.Tensor,
+    shift: tuple[int, int] = (0, 0),
+    half: AbstractContextManager[object] = FULL,
 ) -> torch.Tensor:
-    """What the network makes of moments: logits, or the condition of the flow."""
+    """What the network makes of moments: logits, or the condition of the flow. half: in which it looks at pictures."""
     count, history = len(batch.chunk), network.config.history
     words = None if network.words is None or batch.words is None else network.words(batch.words)
     seen = {name: _moved(value, shift) for name, value in batch.seen.items()} if any(shift) else batch.seen
     if batch.windows is None:
-        features = network.features(seen, None if words is None else words.repeat_interleave(history, 0))
+        with half:
+            features = network.features(seen, None if words is None else words.repeat_interleave(history, 0)).float()
         return network(features.view(count, history, -1), acted, words, batch.outcome)
-    features = window_features(network, seen, words, batch.windows)
+    with half:
+        features = window_features(network, seen, words, batch.windows).float()
     recalled = network.recall(features, None)[0].flatten(0, 1)[:, None]
     every = None if words is None else words.repeat_interleave(batch.windows.shape[1], 0)
     return network(recalled, acted, every, batch.outcome)
