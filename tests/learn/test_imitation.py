@@ -6,6 +6,7 @@ import json
 import warnings
 from copy import copy
 from dataclasses import replace
+from shutil import copytree
 
 import gymnasium
 import numpy as np
@@ -21,7 +22,7 @@ from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
 from terrella.act.planning import PlaySettings, play
 from terrella.act.sentences import WORDS, WordEncoder, vocabulary_of
 from terrella.cli import main
-from terrella.core.errors import ActionError, ChannelError, DatasetError, PlanningError, TrainingError
+from terrella.core.errors import ActionError, ChannelError, CheckpointError, DatasetError, PlanningError, TrainingError
 from terrella.core.instruction import bytes_to_text, text_to_bytes
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
@@ -404,3 +405,12 @@ def test_an_environment_of_other_actions_is_refused_before_training(fetch, tmp_p
     words = ["--from", str(fetch[1]), "--real", "gym:MountainCarContinuous-v0", "--out", str(tmp_path / "run")]
     assert main(["train", "policy", "--method", "imitation", *words]) == 2
     assert "it is for other actions" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_a_policy_of_another_release_is_named(fetch, tmp_path):
+    world, _, facts = fetch
+    copytree(facts["policy"], tmp_path / "old")
+    saved = json.loads((tmp_path / "old/policy.json").read_text())
+    (tmp_path / "old/policy.json").write_text(json.dumps({**saved, "version": 1}))
+    with pytest.raises(CheckpointError, match="another release .*train it again"):
+        terrella.load_policy(str(tmp_path / "old"), world.spec)

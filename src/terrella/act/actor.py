@@ -81,11 +81,13 @@ def load_network(
     its own or that of the training run. CheckpointError if it is missing, foreign or damaged."""
     folder = policy_folder(folder)
     saved = read_policy(folder)
-    if (saved.get("kind"), saved.get("version")) != (kind, version):
+    if saved.get("kind") == kind and saved.get("version") != version:
         raise CheckpointError(
-            f"{folder} is a policy of kind {saved.get('kind')!r}, version {saved.get('version')}; expected kind '{kind}', "
-            f"version {version}."
+            f"{folder} is a policy of another release (version {saved.get('version')}, and this one reads {version}); train it "
+            "again."
         )
+    if saved.get("kind") != kind:
+        raise CheckpointError(f"{folder} is a policy of kind {saved.get('kind')!r}; expected kind '{kind}'.")
     try:
         network = make({name: _tuple(value) for name, value in saved["config"].items()})
         network.load_state_dict(load_file(folder / WEIGHTS_FILE))

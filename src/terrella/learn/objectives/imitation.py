@@ -46,7 +46,8 @@ class BehaviourCloning:
     def losses(self, batch: Demonstrations, now: TrainStep) -> Iterator[Loss]:
         network, config, count = self.network, self.network.config, len(batch.chunk)
         hidden = torch.from_numpy(now.rng.random(count) < FORGOTTEN).to(batch.acted.device)
-        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now), now.half())
+        half = now.half() if any(look.picture for look in network.looks) else FULL
+        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now), half)
         if config.actor.mode == AXES:
             data, out = batch.chunk.flatten(1).repeat(DRAWS, 1), out.repeat(DRAWS, 1)
             time, noise = now.rand(len(data)), now.randn(*data.shape)
