@@ -27,6 +27,12 @@ BOUNDS = {
     "numbers": {"episode_index": np.repeat([7, 3, 9], LENGTHS)},
     "IQL": {"dones_float": LAST.astype(np.float32), "masks": np.ones(ROWS)},
     "RLlib": {"terminateds": np.arange(ROWS) == 4, "truncateds": np.arange(ROWS) == 8},
+    "RLDS": {"steps/is_first": FIRST, "steps/is_last": LAST},
+    "time limits": {"TimeLimit.truncated": LAST},
+    "cumulative": {"cu_seqlens": np.array([0, 5, 9, 12])},
+    "where it goes on": {"not_done": 1.0 - LAST},
+    "discounts": {"discounts": np.where(LAST, 0.0, 0.99)},
+    "MushroomRL": {"absorbing": np.zeros(ROWS, bool), "last": LAST},
     "first rows": {"path_starts": np.array([0, 5, 9])},
     "first rows and lengths": {"ep_offset": np.array([0, 5, 9]), "ep_len": np.array(LENGTHS)},
 }
@@ -184,3 +190,34 @@ def test_names_that_no_sensor_can_have_are_changed_and_named(tmp_path):
     assert {"observation.a_b", "observation.a_b_2", "observation.gr_e"} <= set(source.sensors)
     said = [note for note in source.notes if "is called" in note]
     assert len(said) == 3 and any("'observations/größe' is called 'observation.gr_e'" in note for note in said)
+
+
+def test_a_group_for_each_episode(tmp_path):
+    counts, look = (4, 3), np.random.default_rng(0).random((5, 24, 32), np.float32)
+    for number, head in enumerate(("traj_", "", "data/demo-", "trajectories/episode ")):
+        arrays = {"about": np.zeros(3)}
+        for episode, count in enumerate(counts):
+            more = {
+                "obs/agent/qpos": STATE[: count + 1],
+                "obs/hand_depth": look[: count + 1],
+                "actions": ACTION[:count],
+            }
+            arrays |= {f"{head}{episode + 9}/{key}": values for key, values in more.items()}  # 9 before 10
+        saved(tmp_path / f"{number}.hdf5", arrays)
+        source = open_source(tmp_path / f"{number}.hdf5", fps=20)
+        assert sum("'about' is left out" in note for note in source.notes) == 1
+        for take, count in zip(source.takes(), counts, strict=True):
+            seen = {name: np.stack(list(it.values)) for name, it in take.readings.items()}
+            np.testing.assert_array_equal(seen["observation.agent.qpos"], STATE[: count + 1])
+            np.testing.assert_array_equal(seen["action"], ACTION[:count])
+            np.testing.assert_array_equal(seen["observation.depth.hand"], look[: count + 1])
+
+
+def test_names_of_tianshou_and_the_next_state_of_another(tmp_path):
+    after = STATE + 0.5
+    saved(tmp_path / "a.npz", {"obs": STATE, "act": ACTION, "rew": ROWS - ACTION, "done": LAST, "obs_next": after})
+    saved(tmp_path / "b.npz", {"state": STATE, "action": ACTION, "last": LAST, "next_state": after})
+    one, other = (list(open_source(tmp_path / name).takes()) for name in ("a.npz", "b.npz"))
+    assert set(one[1].readings) == {"observation.state", "action", "next.reward", "next.done"}
+    np.testing.assert_array_equal(one[1].readings["observation.state"].values, [*STATE[5:9], after[8]])
+    assert not any("next_state" in name for name in other[0].readings), "what comes next is no observation"

@@ -114,7 +114,9 @@ def lerobot_folder(folder: str | Path) -> Path | None:
             try:
                 saved = _json(place / CONFIG)
             except (OSError, ValueError):
-                continue
+                saved = (
+                    {"type": "", "input_features": {}} if (place / WEIGHTS).exists() else None
+                )  # damaged: see `read`
             if isinstance(saved, dict) and "type" in saved and "input_features" in saved:
                 return place
     return None

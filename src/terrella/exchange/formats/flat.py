@@ -18,30 +18,40 @@ from .spaces import is_instruction, split_texts
 
 SPELLINGS = {  # `rollouts.write` uses the first
     rows.OBSERVATION: ("observations", "observation", "obs"),
-    rows.ACTION: ("actions", "action", "acts"),
-    rows.REWARD: ("rewards", "reward", "rews"),
+    rows.ACTION: ("actions", "action", "acts", "act"),
+    rows.REWARD: ("rewards", "reward", "rews", "rew"),
     rows.DONE: (
         "terminations", "terminated", "terminateds", "terminals", "terminal", "terminal_flags", "dones", "done",
-        "dones_float", "done_bool", "done_flags", "is_terminal", "is_done",
+        "dones_float", "done_bool", "done_flags", "is_terminal", "is_done", "next_done", "next_dones", "absorbing",
     ),
-    rows.TRUNCATED: ("truncations", "truncated", "truncateds", "timeouts", "timeout", "is_truncated"),
+    rows.TRUNCATED: ("truncations", "truncated", "truncateds", "timeouts", "timeout", "is_truncated",
+        "TimeLimit.truncated", "TimeLimit_truncated"),
     rows.INFO: ("infos", "info"),
 }  # fmt: skip
 NAMES = {spelling: role for role, spellings in SPELLINGS.items() for spelling in spellings}
-NEXT = ("next_observations", "next_observation", "next_obs")
-LAST, FIRST = ("is_last",), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
+NEXT = ("next_observations", "next_observation", "next_obs", "obs_next", "next_state", "next_states")
+LAST, FIRST = ("is_last", "last"), ("is_first", "episode_starts", "episode_start")  # flags with a row for each step
 _STEP_TYPE, _LAST_STEP = "step_type", 2  # of dm_env
 # of each episode the row after its last one; its last one, where the very last row is named
-_ENDS = ("episode_ends", "traj_ends", "trajectory_ends", "ep_ends")
+_ENDS = ("episode_ends", "traj_ends", "trajectory_ends", "ep_ends", "episode_data_index.to", "cu_seqlens")
 LENGTHS = ("episode_lengths", "traj_lengths", "trajectory_lengths", "path_lengths", "ep_lengths", "ep_len")
 # of each episode its first row; "episode_starts" may also be a flag for each step
-_STARTS = ("episode_starts", "traj_starts", "trajectory_starts", "path_starts", "ep_offset", "episode_offsets")
+_STARTS = (
+    "episode_starts",
+    "traj_starts",
+    "trajectory_starts",
+    "path_starts",
+    "ep_offset",
+    "episode_offsets",
+    "episode_data_index.from",
+)
 _NUMBERS = (  # of the episode of each row
     "episode_index", "episode_id", "episode_ids", "episode", "episode_num", "ep_idx", "traj_id", "traj_ids",
     "trajectory_id", "trajectory_ids", "demo_id",
 )  # fmt: skip
+_GOES_ON = ("not_done", "not_dones", "not_terminal", "nonterminal", "nonterminals", "discounts")  # 0 at an end
 _COUNTERS = ("step_idx", "step", "timestep", "frame_index", "discount", "valids", "masks")
-_FOLDERS = ("data", "meta")  # of diffusion policy's files
+_FOLDERS = ("data", "meta", "steps")  # of diffusion policy's files, of RLDS
 Times = Callable[[int], np.ndarray]
 BARE = "no array has a name of observations: others with a row for each step are taken for them."
 
@@ -97,6 +107,9 @@ def home(place: Place) -> Place:
 def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     """The sensor of an array with a row for each step. One of an unknown name is a picture, if its bytes look like one; else
     "info.NAME", or an observation if `bare` (no array has a name of observations) and its name is not about steps."""
+    below = place[1:] if len(place) > 1 and place[0] in NAMES else place
+    if depth := rows.depth_sensor(arrays.joined(below), shape, dtype):
+        return depth
     if place[0] in NAMES:
         return arrays.sensor_at(NAMES, place, shape, dtype)
     about_steps = place[0] in (*LAST, *FIRST, *_NUMBERS, *_COUNTERS, _STEP_TYPE)
@@ -187,6 +200,7 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             raise DatasetError(f"'{head}' in {where} has {has}: store episodes one after another, or a file each.")
         if starts or head in (*_ENDS, *LENGTHS):
             values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
+            values = values[values > 0] if head in _ENDS else values  # "cu_seqlens" begins with 0
             stops = np.cumsum(values) if head in LENGTHS else values + (values.max(initial=0) == count - 1)
             stops = np.append(values[1:], count) if starts else stops
             if (np.diff(stops, prepend=0) < 1).any() or stops.max(initial=0) > count:
@@ -200,6 +214,10 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             flags |= array.read(0, count).reshape(-1) == _LAST_STEP
         elif rowwise and (flag or head in LAST):
             flags |= np.nan_to_num(array.read(0, count).reshape(-1)).astype(bool)
+    if not flags.any() and not ends.any():
+        for head in _GOES_ON:
+            if (head,) in stored and math.prod(stored[(head,)].shape) == stored[(head,)].shape[0] == count:
+                flags |= stored[(head,)].read(0, count).reshape(-1) == 0
     if count > 1 and flags[-2:].all() and not flags[-3:-2].any():
         flags[-2] = False  # flagged at the last step and at the terminal observation
     return ends if ends.any() else flags

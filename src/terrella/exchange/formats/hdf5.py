@@ -51,6 +51,8 @@ def _layout_of(path: Path) -> str:
         heads = {*names, *_below(file, names, "data"), *_below(file, names, "meta")}
         if heads & set(flat.SPELLINGS[rows.ACTION]) and len(heads) > 1:
             return "d4rl"
+        if d4rl.groups_of(file):
+            return "d4rl"
         contents = ", ".join(sorted(names, key=rows.natural)[:12]) or "nothing"
     raise DatasetError(
         f"{path} is none of the known layouts (robomimic: data/demo_0; Counter-Strike: frame_0_x, frame_0_y; D4RL: "

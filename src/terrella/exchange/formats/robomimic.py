@@ -96,10 +96,8 @@ def _guess(place: arrays.Place, shape: tuple[int, ...], dtype: np.dtype) -> Sens
         if place and place[0] not in _NAMES:
             return rows.sensor_for(rows.INFO, arrays.joined(place), shape, dtype)
         return arrays.sensor_at(_NAMES, place, shape, dtype) if len(place) == 1 else None
-    if key.endswith("_depth") and dtype == np.float32 and len(shape) in (2, 3) and shape[2:] in ((), (1,)):
-        rows.check_size(shape[0], shape[1], f"'{key}'")
-        name = f"{rows.DEPTH}.{rows.clean(key.removesuffix('_depth'))}"
-        return rows.stored_as(Sensor(name, "depth", shape[:2], "float32"), shape)
+    if depth := rows.depth_sensor(key, shape, dtype):
+        return depth
     least = 1 if key.endswith("_image") else rows.LEAST_PICTURE_SIDE
     sensor = rows.sensor_for(rows.OBSERVATION, rows.clean(arrays.spelled(place[1:])), shape, dtype, least)
     return replace(sensor, name=sensor.name.removesuffix("_image")) if sensor.kind == "image" else sensor

@@ -66,6 +66,17 @@ def sensor_for(role: str, key: str, shape: Sequence[int], dtype, least: int = LE
     return stored_as(Sensor(f"{IMAGES}{camera}", "image", (height, width, 3), "uint8"), shape)
 
 
+def depth_sensor(key: str, shape: Sequence[int], dtype) -> Sensor | None:
+    """The sensor of pictures of metres, float32 [H, W] or [H, W, 1] called depth or NAME_depth; None for other arrays."""
+    *_, end = re.split(r"[._/]", key)
+    shape = tuple(int(n) for n in shape)
+    if end != "depth" or dtype != np.float32 or len(shape) not in (2, 3) or shape[2:] not in ((), (1,)):
+        return None
+    check_size(shape[0], shape[1], f"'{key}'")
+    camera = key.removesuffix("depth").rstrip("._/")
+    return stored_as(Sensor(f"{DEPTH}.{clean(camera)}" if camera else DEPTH, "depth", shape[:2], "float32"), shape)
+
+
 def stored_as(sensor: Sensor, shape: tuple[int, ...]) -> Sensor:
     """The sensor with `shape` as the stored shape of its readings; `stored_shape` ignores one that does not fit."""
     facts = {key: value for key, value in sensor.facts.items() if key != _STORED}
