@@ -10,8 +10,7 @@ OMP_NUM_THREADS=1 terrella train video recordings/doom-maze --out runs/doom-maze
 # The run ends with an estimator for lone pictures and an uncertainty that says when it invents. Those of the bundled world were
 # given to it afterwards, in 11 minutes beside other work, from a recording made by the line above:
 #   terrella train uncertainty doom-maze --data recordings/doom-maze --out runs/sensing --estimator-steps 1600 --uncertainty-frames 3500
-# How its position drifts was fitted later, on four rollouts of 1,000 steps of a recording of seed 11:
-#   python lab/calibrate_drift.py doom-maze --data recordings/maze-11 --test recordings/maze-12 --everywhere --out runs/drift
+# How its position drifts was fitted later, by fit_drift of learn/objectives/drift.py on rollouts of several policies: docs/lab/log.md.
 mkdir -p src/terrella/bundled
 rm -rf src/terrella/bundled/doom-maze
 cp -r runs/doom-maze/world src/terrella/bundled/doom-maze
