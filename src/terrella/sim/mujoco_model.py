@@ -173,21 +173,21 @@ def coupled_joints(model: mujoco.MjModel) -> list[dict[int, tuple[float, float]]
 def _joint_equalities(model: mujoco.MjModel) -> list[tuple[int, int, list[float]]]:
     """Active equality constraints of joints, or of fixed tendons of one or two joints: the joint, the one that it follows (-1:
     none), and the polynomial."""
-    found = []
+    equalities = []
     for at in np.flatnonzero(model.eq_active0):
         one, other, data = int(model.eq_obj1id[at]), int(model.eq_obj2id[at]), model.eq_data[at, :5]
         if model.eq_type[at] == int(mujoco.mjtEq.mjEQ_JOINT):
-            found.append((one, other, data.tolist()))
+            equalities.append((one, other, data.tolist()))
         if model.eq_type[at] != int(mujoco.mjtEq.mjEQ_TENDON):
             continue
         parts, others = _tendon_joints(model, one), _tendon_joints(model, other) if other >= 0 else []
         if len(parts) == 1 and len(others) == (other >= 0):
             driver, coefficient = others[0] if others else (-1, 0.0)
-            found.append((parts[0][0], driver, (data * coefficient ** np.arange(5) / parts[0][1]).tolist()))
+            equalities.append((parts[0][0], driver, (data * coefficient ** np.arange(5) / parts[0][1]).tolist()))
         elif len(parts) == 2 and other < 0:  # the sum of both is constant
             (joint, first), (driver, second) = reversed(parts)
-            found.append((joint, driver, [data[0] / first, -second / first, 0.0, 0.0, 0.0]))
-    return found
+            equalities.append((joint, driver, [data[0] / first, -second / first, 0.0, 0.0, 0.0]))
+    return equalities
 
 
 def _tendon_joints(model: mujoco.MjModel, tendon: int) -> list[tuple[int, float]]:
