@@ -107,8 +107,8 @@ def home(place: Place) -> Place:
 def guess(bare: bool, place: Place, shape: tuple[int, ...], dtype: np.dtype) -> Sensor | None:
     """The sensor of an array with a row for each step. One of an unknown name is a picture, if its bytes look like one; else
     "info.NAME", or an observation if `bare` (no array has a name of observations) and its name is not about steps."""
-    below = place[1:] if len(place) > 1 and place[0] in NAMES else place
-    if depth := rows.depth_sensor(arrays.joined(below), shape, dtype):
+    head, *below = place
+    if depth := rows.depth_sensor(arrays.joined((*below,) if below and head in NAMES else place), shape, dtype):
         return depth
     if place[0] in NAMES:
         return arrays.sensor_at(NAMES, place, shape, dtype)
