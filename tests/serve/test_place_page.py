@@ -232,6 +232,22 @@ def test_bodies_move_as_they_do_in_python(tmp_path, opened):
         page.evaluate("edits => { terrella.editor.change(() => terrella.story.replay(edits)); }", EDITS[:1])
 
 
+def test_a_closed_collider_stays_closed_after_an_edit(tmp_path, opened):
+    open_place = world(6000)
+    config = replace(open_place.config, collider="indoor")
+    closed = SplatWorld("closed", open_place.gaussians, open_place.provenance, open_place.starts, config)
+    save_splat(closed, tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page, place = opened((tmp_path / "place.html").as_uri()), closed.occupancy
+    page.evaluate("edits => { terrella.editor.change(() => terrella.story.replay(edits)); }", EDITS[:1])
+    theirs = torch.tensor(page.evaluate("[...terrella.solid.solid]")).view(place.solid.shape).bool()
+    edited = Occupancy.of(apply_edits(place_of := open_place.gaussians, EDITS[:1]).gaussians)
+    assert edited.solid.shape == place.solid.shape == theirs.shape
+    changed = edited.solid != Occupancy.of(place_of).solid
+    assert changed.any() and (theirs == torch.where(changed, edited.solid, place.solid)).float().mean() > 0.999
+    assert (theirs & ~edited.solid).sum() > 1000  # what no flood reaches is still solid
+
+
 def test_known_walls_are_met_as_in_python(tmp_path, opened):
     boxes = torch.tensor(
         [[-1, -1, -0.2, 5, 5, 0], [4, -1, 0, 4.2, 5, 3], [1, 1, 0, 2, 2, 0.3], [0, 3, 0, 4, 3.2, 2]]

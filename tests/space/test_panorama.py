@@ -12,13 +12,12 @@ from PIL import Image
 
 import terrella
 from terrella.cli import main
-from terrella.space.camera import FAR_M
+from terrella.space.camera import FAR_M, directions
 from terrella.space.lifting import panorama
 from terrella.space.lifting.network import Lifter, LifterConfig
 from terrella.space.lifting.panorama import (
     PanoramaLayers,
     cut,
-    directions,
     offsets,
     panorama_gaussians,
     panorama_layers,

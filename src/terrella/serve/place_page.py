@@ -86,6 +86,7 @@ class PlacePage:
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
+            "closed": place.closed,
             "command": starting_command() if save or watch or frames else "",
         }  # fmt: skip
         parts = {

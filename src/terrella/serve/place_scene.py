@@ -30,3 +30,4 @@ class PlaceScene:
     names: Sequence[str] = ()  # of the objects 1, 2, ...
     other: Callable[[Edit], PlaceScene] | None = None  # opens the place that an edit merges
     note: str = ""  # a sentence that the page shows when it opens
+    closed: bool = False  # the collider says more than what the Gaussians fill (space/enclosure.py)

@@ -3,6 +3,7 @@
 Frames: world z up; camera x forward, y left, z up. A pose is float32 [..., 7]: x, y, z in metres, then the quaternion
 w, x, y, z of T_world_cam. Depth is metres along the optical axis. Intrinsics are (fx/W, fy/H, cx/W, cy/H)."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -139,3 +140,11 @@ def planar_pose(x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torc
     half = heading / 2
     zero = constant(torch.tensor, half.device, 0.0).expand_as(half)
     return torch.stack([x, y, z, torch.cos(half), zero, zero, torch.sin(half)], -1)
+
+
+def directions(height: int) -> torch.Tensor:
+    """Unit vectors [H, 2H, 3] through the pixels of a panorama: x forward in its middle, y left, z up."""
+    lon = math.pi * (1 - (torch.arange(2 * height) + 0.5) / height)
+    lat = math.pi * (0.5 - (torch.arange(height) + 0.5) / height)[:, None]
+    level = lat.cos()
+    return torch.stack([level * lon.cos(), level * lon.sin(), lat.sin().expand(height, 2 * height)], -1)

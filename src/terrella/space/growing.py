@@ -4,14 +4,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 
-from .camera import Intrinsics, project, rays, rotation
+from .camera import Intrinsics, directions, project, rays, rotation
 from .lifting.layers import layers_of, of_pixels
 from .lifting.network import Lifter
-from .lifting.panorama import directions
 from .lifting.prior import fitted_depth
 from .lifting.scenes import rotation_of
 from .raster import Drawing, Gaussians, rasterise
@@ -155,12 +153,3 @@ def psnr_of(one: torch.Tensor, other: torch.Tensor, some: torch.Tensor) -> float
     """PSNR in dB of pictures [3, H, W] on the pixels `some` [H, W]; at most 99."""
     off = float((one - other)[:, some].square().mean()) if bool(some.any()) else 0.0
     return -10 * math.log10(max(off, 10**-9.9))
-
-
-def spread_out(places: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
-    """`count` of places [N, 3] that lie far apart, from the first on; equally far ones by chance."""
-    chosen = places[:1]
-    for _ in range(min(count, len(places)) - 1):
-        far = torch.cdist(places, chosen).amin(1) + 1e-3 * torch.from_numpy(rng.random(len(places))).float()
-        chosen = torch.cat([chosen, places[far.argmax()][None]])
-    return chosen

@@ -7,12 +7,14 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from .camera import rotation
 from .raster import Gaussians
 
 MOST_CELLS = 24_000_000
+LEFT_OUT = (0.001, 0.005, 0.02)  # shares of the points at each end of an axis that may lie beyond the grid
 SOLID = 0.3  # Gaussians above this opacity are obstacles
 _SAMPLES = 32  # sample points of a Gaussian
 _FEWEST = 6  # samples that make a cell solid; those of a Gaussian wider than a cell count once per cell that it covers
@@ -65,17 +67,29 @@ class Occupancy:
         shape = tuple(size.tolist())
         return Occupancy(low, cell_m, (count >= _FEWEST).view(shape), top.view(shape))
 
+    @property
+    def bounds(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Its low and high corners, each [3]."""
+        return self.origin, self.origin + self.cell_m * torch.tensor(self.solid.shape)
+
     def blocked(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
         """Whether walkers at `place` [B, 3] overlap a solid cell: bool [B]. Cells as low as a step do not count."""
         angle = torch.arange(8) * (math.pi / 4)
-        ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * body.radius_m, torch.zeros(1, 2)])
+        radius = max(
+            body.radius_m - 0.5 * self.cell_m, 0.5 * body.radius_m
+        )  # surfaces lie in the middle of cells on average
+        ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * radius, torch.zeros(1, 2)])
         low, high = -body.eye_m + body.step_m, body.head_m
         levels = torch.linspace(low, high, max(2, math.ceil((high - low) / self.cell_m) + 1))
         offset = torch.cat(
             [ring[:, None].expand(-1, len(levels), 2), levels[None, :, None].expand(len(ring), -1, 1)], 2
         )
-        cells, inside = self._cells(place[:, None] + offset.flatten(0, 1).to(place))
-        return (self.solid[cells] & inside).any(1)
+        return self.holds(place[:, None] + offset.flatten(0, 1).to(place)).any(1)
+
+    def holds(self, points: torch.Tensor) -> torch.Tensor:
+        """Whether points [..., 3] lie in a solid cell: bool [...]."""
+        cells, inside = self.cells(points)
+        return self.solid[cells] & inside
 
     def floor(self, place: torch.Tensor, body: Walker) -> torch.Tensor:
         """Height of the floor under walkers [B]; without one, the feet."""
@@ -90,7 +104,7 @@ class Occupancy:
         near = torch.tensor([-1.0, 0.0, 1.0]) * self.cell_m
         offset = torch.stack(torch.meshgrid(near, near, down, indexing="ij"), -1).to(place)  # [3, 3, deep, 3]
         below = torch.stack([place[:, 0], place[:, 1], feet], 1)
-        cells, inside = self._cells(below[:, None, None, None] + offset)
+        cells, inside = self.cells(below[:, None, None, None] + offset)
         solid = self.solid[cells] & inside
         first = solid.int().argmax(3, keepdim=True)
         tops = self.top[cells].gather(3, first)[..., 0]
@@ -104,7 +118,11 @@ class Occupancy:
         stuck = self.blocked(place, body)
         return slide(lambda at: (self.blocked(at, body) & ~stuck).float(), place, wish)
 
-    def _cells(self, points: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
+    def cell_of(self, point: torch.Tensor) -> np.ndarray:
+        """The indices [3] of the cell in which a point [3] lies, or of the nearest."""
+        return torch.stack(self.cells(point)[0]).numpy()
+
+    def cells(self, points: torch.Tensor) -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
         """Indices of the cells of points [..., 3], and whether they are in the grid."""
         at = ((points - self.origin) / self.cell_m).floor().long()
         size = torch.tensor(self.solid.shape)
@@ -112,11 +130,14 @@ class Occupancy:
 
 
 def extent(means: torch.Tensor, cell_m: float = 0.1) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """The corners [3] of a grid around points [N, 3], and its cell size: `cell_m`, or larger to keep within MOST_CELLS."""
+    """The corners [3] of a grid around points [N, 3], and its cell size: `cell_m`, or larger to keep within MOST_CELLS. Where cells
+    would be larger, more of the outermost points are left out."""
     step = max(len(means) // 1_000_000, 1)
-    low, high = torch.quantile(means[::step], torch.tensor([0.001, 0.999]), dim=0)
-    low, high = low - 0.5, high + 0.5
-    return low, high, max(cell_m, float(((high - low).prod() / MOST_CELLS) ** (1 / 3)))
+    ends = torch.tensor([[share, 1 - share] for share in LEFT_OUT])
+    low, high = torch.quantile(means[::step], ends.flatten(), dim=0).view(-1, 2, 3).unbind(1)
+    sides = [(float((two - one + 1).prod()) / MOST_CELLS) ** (1 / 3) for one, two in zip(low, high)]
+    at = next((k for k, side in enumerate(sides) if side <= cell_m), len(sides) - 1)
+    return low[at] - 0.5, high[at] + 0.5, max(cell_m, sides[at])
 
 
 def slide(depth: Callable[[torch.Tensor], torch.Tensor], place: torch.Tensor, wish: torch.Tensor) -> torch.Tensor:

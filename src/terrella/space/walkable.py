@@ -2,6 +2,7 @@
 
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from .occupancy import Walker
@@ -67,3 +68,12 @@ def _first(cells: torch.Tensor, heights: torch.Tensor) -> tuple[torch.Tensor, to
     row = {tuple(cell): at for at, cell in reversed(list(enumerate(cells.tolist())))}
     keep = torch.tensor(sorted(row.values()), dtype=torch.long)
     return cells[keep], heights[keep]
+
+
+def spread_out(places: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
+    """`count` of places [N, 3] that lie far apart, from the first on; equally far ones by chance."""
+    chosen = places[:1]
+    for _ in range(min(count, len(places)) - 1):
+        far = torch.cdist(places, chosen).amin(1) + 1e-3 * torch.from_numpy(rng.random(len(places))).float()
+        chosen = torch.cat([chosen, places[far.argmax()][None]])
+    return chosen

@@ -16,6 +16,7 @@ import torch
 from ..core.errors import DatasetError, TerrellaError
 from ..learn.recipes.splat import SplatFit, Watch, fit_splat
 from ..serve.live_place import live_page
+from ..space.enclosure import ColliderChoice
 from ..space.files import read_scene, replace_whole
 from ..space.files.gltf_scene import GLTF_ENDINGS, GltfScene, read_gltf
 from ..space.layout import BuiltPlace, ParsedText, build, parse_text, read_layout
@@ -55,6 +56,12 @@ class ImportSpaceConfig:
     (x forward, y left, z up: Terrella's)."""
     scale: float = 1.0  # Metres per unit of the file.
     size: tuple[int, int] = (192, 256)  # Height and width of the pictures, in pixels.
+    collider: ColliderChoice = "auto"
+    """How what stops walkers is closed: indoor, outdoor (also without walls: floors go on, the inside of things is solid), object
+    (solid, on a level floor), or open: only what the Gaussians fill. auto chooses by what surrounds the start."""
+    inside: tuple[float, float, float] | None = None
+    """A point in free space (x y z in metres, z up) where one begins, and from which inside and outside are distinguished. Default: the
+    free place nearest to the middle."""
 
 
 def fit_space(
@@ -97,13 +104,21 @@ def import_space(file: Path, out: Path, config: ImportSpaceConfig) -> SpaceResul
         if not isinstance(scene, GltfScene):
             scene = read_scene(file, config.axes)
     if isinstance(scene, GltfScene):
+        if config.collider != "auto" or config.inside is not None:
+            raise TerrellaError(
+                f"{file} holds triangles, which stop walkers as they are; leave --collider and --inside out."
+            )
         return _of_triangles(scene, file, out, BuildSpaceConfig.gaussians, config.size)
     if config.scale != 1:
         scene = transform(scene, torch.eye(3), config.scale)
     left_out = list(dict.fromkeys(str(warning.message) for warning in caught))
-    save_splat(world_of(scene, file.stem, {"file": file.name}, _splat_config(config.size)), out)
-    facts = {"gaussians": len(scene), "world": str(out), "left_out": left_out}
-    return SpaceResult(facts, (f"{len(scene):,} Gaussians; terrella play {out}", *left_out))
+    look = replace(_splat_config(config.size), inside=config.inside)
+    world = world_of(scene, file.stem, {"file": file.name}, look, choice=config.collider)
+    save_splat(world, out)
+    kind = world.config.collider
+    facts = {"gaussians": len(scene), "world": str(out), "collider": kind, "left_out": left_out}
+    chosen = f"collider: {kind}" + (" (--collider sets another)" if config.collider == "auto" else "")
+    return SpaceResult(facts, (f"{len(scene):,} Gaussians; {chosen}; terrella play {out}", *left_out))
 
 
 def build_space(

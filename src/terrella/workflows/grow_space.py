@@ -12,7 +12,7 @@ import torch
 
 from ..core.errors import TerrellaError
 from ..library import folder_of
-from ..space.camera import Intrinsics, rotation
+from ..space.camera import Intrinsics, directions, rotation
 from ..space.growing import (
     KNOWN,
     ROWS,
@@ -25,14 +25,14 @@ from ..space.growing import (
     next_view,
     planar_fill,
     psnr_of,
-    spread_out,
 )
 from ..space.lifting.network import load_lifter
-from ..space.lifting.panorama import directions
+from ..space.occupancy import Occupancy
 from ..space.raster import Gaussians, join, rasterise
 from ..space.room_planes import room_planes
+from ..space.walkable import spread_out, walkable
 from ..worlds.additions import INVENTED, OBSERVED
-from ..worlds.splat import SplatConfig, SplatWorld
+from ..worlds.splat import MOST_PLACES, SplatConfig, SplatWorld
 from ..worlds.splat_folder import merge_edit, read_edits, save_splat, write_edits
 from .progress import Progress, silent
 from .results import command
@@ -110,7 +110,8 @@ def grow_space(world: str, config: GrowSpaceConfig, *, progress: Progress = sile
 def viewpoints(place: SplatWorld, seed: int) -> torch.Tensor:
     """Points [E, 3] of eyes in free space: the first start, and others that one can walk to from there."""
     start = place.starts[:1, :3]
-    reached = place.places[place.places[:, 3] > 0]
+    open_collider = place.collider if len(place.solids) else Occupancy.of(place.gaussians)  # no floor that is not there
+    reached = walkable(open_collider, place.starts[:, :3], place.config.body, MOST_PLACES)
     eyes = torch.cat([reached[:, :2], start[:, 2:].expand(len(reached), 1)], 1)
     return spread_out(torch.cat([start, eyes]), EYES, np.random.default_rng(seed))
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 from ..core.errors import DatasetError, TerrellaError
 from ..space.camera import planar_pose
+from ..space.enclosure import ColliderKind
 from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of, to_gaussians
 from ..space.lifting.network import Lifter, load_lifter
 from ..space.lifting.panorama import PanoramaLayers, panorama_gaussians, panorama_layers, wraps
@@ -45,6 +46,9 @@ class LiftSpaceConfig:
     unless --fov is given."""
     # Height of the camera above the floor in metres, which gives the scale. Default: both estimated from the picture.
     eye: float | None = None
+    collider: ColliderKind = "indoor"
+    """How what stops walkers is closed: indoor (the floor goes on for 1 m beyond what is seen, and ends there), outdoor (it goes on
+    for as long as the place is), object, or open: only what the Gaussians fill."""
 
 
 def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: Progress = silent) -> SpaceResult:
@@ -81,7 +85,8 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
     layers = layers_of(rgb, lifter, focal, config.eye)
     doubtful = doubts(layers)
-    world = place_of(layers, picture.stem, {"picture": picture.name} | ({"doubts": doubtful} if doubtful else {}))
+    card = {"picture": picture.name} | ({"doubts": doubtful} if doubtful else {})
+    world = place_of(layers, picture.stem, card, config.collider)
     save_splat(world, out)
     facts = {
         "fov_deg": round(_fov(layers), 1), "pitch_deg": round(math.degrees(layers.pitch), 1),
@@ -104,23 +109,23 @@ def _lift_panorama(
         )
     even = np.asarray(Image.fromarray(rgb).resize((width // 4 * 4, width // 4 * 2), Image.Resampling.BOX))
     layers = panorama_layers(even, lifter, config.eye)
-    world = panorama_place(layers, picture.stem, {"panorama": picture.name})
+    world = panorama_place(layers, picture.stem, {"panorama": picture.name}, config.collider)
     save_splat(world, out)
     seen = _Seen(layers.distance, layers.error, layers.height_m, {"panorama": True}, "all directions, ")
     return _result(seen, world, out, lifter.measured, notes)
 
 
-def panorama_place(layers: PanoramaLayers, name: str, card: dict) -> SplatWorld:
+def panorama_place(layers: PanoramaLayers, name: str, card: dict, collider: ColliderKind = "indoor") -> SplatWorld:
     """The place of a panorama's layers: one begins in its middle, in eight directions."""
     gaussians, seen = panorama_gaussians(layers)
     high = torch.full((8,), layers.height_m)
     starts = planar_pose(torch.zeros(8), torch.zeros(8), high, torch.arange(8) * (math.pi / 4))
     origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
-    config = SplatConfig((0.5, 0.5 * 4 / 3, 0.5, 0.5), (192, 256), body=_walker(layers.height_m))
+    config = SplatConfig((0.5, 0.5 * 4 / 3, 0.5, 0.5), (192, 256), body=_walker(layers.height_m), collider=collider)
     return SplatWorld(name, gaussians, origin, starts, config, card | {"axes": AXES})
 
 
-def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
+def place_of(layers: PictureLayers, name: str, card: dict, collider: ColliderKind = "indoor") -> SplatWorld:
     """The place of a picture's layers, with a walker whose eyes are where its camera was."""
     gaussians, seen = to_gaussians(layers)
     if float(layers.error.mean()) <= UNSURE:
@@ -131,7 +136,7 @@ def place_of(layers: PictureLayers, name: str, card: dict) -> SplatWorld:
     size = (max(round(height * share), 8), max(round(width * share), 8))
     origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
     facts = {"axes": AXES, "fov_deg": round(_fov(layers), 1)}
-    config = SplatConfig(layers.camera, size, body=_walker(layers.height_m))
+    config = SplatConfig(layers.camera, size, body=_walker(layers.height_m), collider=collider)
     return SplatWorld(name, gaussians, origin, layers.pose[None], config, card | facts)
 
 

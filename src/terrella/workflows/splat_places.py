@@ -54,6 +54,7 @@ def page_scene(
     return PlaceScene(
         source.name, source.gaussians, seen, source.objects, source.starts, collider, config.body, config.pace,
         config.keep, config.dt_s, source.object_names, other, "; ".join(_notes(source.card)),
+        config.collider != "open",
     )  # fmt: skip
 
 

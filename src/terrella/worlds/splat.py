@@ -18,6 +18,7 @@ from ..core.spec import PLACES_UNIT, POSE, POSE_UNIT, WALKABLE, Camera, Spec
 from ..core.state import State
 from ..core.world import Observation
 from ..space.camera import Intrinsics, rotation, yaw
+from ..space.enclosure import ColliderKind, enclosed
 from ..space.fitting import resize_depth
 from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Drawing, Gaussians, rasterise
@@ -54,6 +55,10 @@ class SplatConfig:
     keep: tuple[float, float, float, float] = (0.7, 0.7, 0.6, 0.7)  # share of each speed that stays in a step
     body: Walker = Walker()
     additions: int = 32768  # Gaussians that pictures may add to the place of an episode
+    collider: ColliderKind = "open"  # how the grid that the Gaussians fill is closed (space/enclosure.py)
+    inside: tuple[float, float, float] | None = (
+        None  # the point in free space from which that is judged; None: the first start
+    )
 
 
 class SolidBoxes(NamedTuple):
@@ -143,8 +148,10 @@ class SplatWorld:
 
     @cached_property
     def occupancy(self) -> Occupancy:
-        """What the Gaussians fill."""
-        return Occupancy.of(self.gaussians)
+        """What the Gaussians fill, closed as `config.collider` says."""
+        eyes = self.starts[:, :3]
+        eyes = eyes if self.config.inside is None else torch.cat([torch.tensor([self.config.inside]), eyes])
+        return enclosed(self.gaussians, eyes, self.config.collider, self.config.body)
 
     @cached_property
     def collider(self) -> Solids | Occupancy:

@@ -6,9 +6,9 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from safetensors import SafetensorError
@@ -17,8 +17,9 @@ from ..core.errors import CheckpointError, ContractError
 from ..core.files import not_written
 from ..space.camera import planar_pose
 from ..space.edits import Edit, Edited, apply_edits, merged_boxes, merges_of
+from ..space.enclosure import ColliderChoice, ColliderKind, in_free_space, kind_of_place
 from ..space.files import replace_whole
-from ..space.occupancy import Walker
+from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Gaussians
 from .additions import INVENTED, OBSERVED
 from .checkpoint import WORLD_FILE, data_file, read_data, write_checkpoint
@@ -80,6 +81,8 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
         about, (tensors,) = read_data(path, about, "scene")
         settings: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in about["config"].items()}
         config = SplatConfig(**{**settings, "body": Walker(**settings["body"])})
+        if config.collider not in get_args(ColliderKind):
+            raise ValueError(f"its collider {config.collider!r:.20} is unknown")
         provenance, starts = tensors.pop("provenance"), tensors.pop("starts")
         objects = tensors.pop("objects", torch.zeros(len(provenance), dtype=torch.int32))
         if about["card"].get("text") and not provenance.any():  # an older release marked all of what words built
@@ -242,14 +245,17 @@ def world_of(
     config: SplatConfig,
     objects: torch.Tensor | None = None,
     solids: SolidBoxes | None = None,
+    choice: ColliderChoice = "open",
 ) -> SplatWorld:
-    """A world of Gaussians that starts at the free place with a floor that is nearest to their middle, in eight directions."""
+    """A world of Gaussians that starts at the free place with a floor that is nearest to `config.inside`, or else to their middle,
+    in eight directions. choice: how the grid that stops bodies is closed; auto: as the place looks from the start."""
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     world = SplatWorld(name, gaussians, observed, torch.zeros(1, 7), config, card, objects, solids)
     some = gaussians.means[:: max(len(gaussians) // 100_000, 1)]
     low, middle, high = torch.quantile(some, torch.tensor([0.05, 0.5, 0.95]), dim=0)
     rng = torch.Generator().manual_seed(0)
     high[2] += config.body.eye_m  # the eye may be above all Gaussians
+    middle = middle if config.inside is None else torch.tensor(config.inside)
     places = torch.cat([middle[None], low + (high - low) * torch.rand(400, 3, generator=rng)])
     level = world.occupancy.surface(places, config.body)
     grounded = torch.cat([places[:, :2], (level + config.body.eye_m)[:, None]], 1)
@@ -258,4 +264,24 @@ def world_of(
     order = (places - middle).norm(dim=1) + 1e3 * ~stands
     x, y, z = places[order.argmin()].expand(8, 3).unbind(1)
     starts = planar_pose(x, y, z, torch.arange(8) * (torch.pi / 4))
+    config = replace(config, collider=chosen_collider(world.occupancy, starts, config, choice))
     return SplatWorld(name, gaussians, observed, starts, config, card, objects, solids)
+
+
+def chosen_collider(
+    occupancy: Occupancy, starts: torch.Tensor, config: SplatConfig, choice: ColliderChoice
+) -> ColliderKind:
+    """How the grid `occupancy` is closed. ContractError if `config.inside` is no point in free space within it."""
+    if config.inside is not None and not in_free_space(occupancy, torch.tensor(config.inside)):
+        point, (low, high) = " ".join(f"{one:g}" for one in config.inside), occupancy.bounds
+        raise ContractError(
+            f"--inside {point} is not in free space; give x y z in metres within {_corner(low)} and {_corner(high)}, z up, "
+            "where nothing solid is."
+        )
+    if choice != "auto":
+        return choice
+    return kind_of_place(occupancy, starts[0, :3] if config.inside is None else torch.tensor(config.inside))
+
+
+def _corner(point: torch.Tensor) -> str:
+    return f"({', '.join(f'{one:.1f}' for one in point.tolist())})"

@@ -20,7 +20,7 @@ from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
 from ...worlds.checkpoint import WORLD_FILE
 from ...worlds.splat import SplatConfig, SplatWorld
-from ...worlds.splat_folder import check_free, save_splat
+from ...worlds.splat_folder import check_free, chosen_collider, save_splat
 from ..trainer import Report
 from .splat_views import SplatFit, read_views
 
@@ -30,6 +30,7 @@ LOOK_S, LOOK_SHARE, LOOKED_AT = (
     20,
     4,
 )  # seconds between previews, which take at most 1/20 of the time; their test pictures
+LATER = ("save_every_s", "collider", "inside")  # settings that a fit which goes on may change
 HELD_OUT, OF_FEW = (8, 4), 16  # every 8th picture is held out to measure the fit; of fewer than 16 every 4th
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
@@ -46,7 +47,7 @@ def fit_splat(
     """
     out, began = Path(out), time.monotonic()
     _check(config)
-    name = config.name or Path(data).stem or Path(data).resolve().stem
+    named = replace(config, name=config.name or Path(data).stem or Path(data).resolve().stem)
     config = replace(config, name=config.name or "place")  # as in the recipes of earlier runs
     views, spec, left_out = read_views(data, out, config)
     every = HELD_OUT[len(views) < OF_FEW]
@@ -58,12 +59,13 @@ def fit_splat(
         raise TrainingError(f"{data}: {error}") from error
     recipe = {
         "data": str(data),
-        **{name: str(value) for name, value in asdict(config).items() if name != "save_every_s"},
+        **{name: str(value) for name, value in asdict(config).items() if name not in LATER},
     }
     _restore(out / RESUME, fit, recipe)
     finished = fit.done >= config.fit.steps and (out / "world" / WORLD_FILE).exists()
     if not finished:
         check_free(out / "world")
+        _world(fit.gaussians.each(torch.Tensor.detach), seen, spec, named, {})  # refuses a wrong --inside
 
     def preview() -> float:
         """Calls `watch`; returns the time of the next preview."""
@@ -72,7 +74,7 @@ def fit_splat(
         start, now = time.monotonic(), fit.gaussians.each(lambda part: part.detach().clone())
         db = float(psnr(now, tested.at(torch.arange(len(tested))[:: max(len(tested) // LOOKED_AT, 1)])).mean())
         facts = {"step": fit.done, "steps": config.fit.steps, "db": round(db, 1)}
-        watch(lambda: _world(now, seen, spec, name, {}), facts)
+        watch(lambda: _world(now, seen, spec, named, {}), facts)
         return start + max(LOOK_S, LOOK_SHARE * (time.monotonic() - start))
 
     try:
@@ -85,7 +87,7 @@ def fit_splat(
     if not finished:  # else it may have been edited since
         _save(out / RESUME, fit, recipe)
         card = {"data": str(data), "left_out": left_out, **figures}
-        save_splat(_world(fit.gaussians, seen, spec, name, card), out / "world")
+        save_splat(_world(fit.gaussians, seen, spec, named, card), out / "world")
     return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
 
 
@@ -130,18 +132,20 @@ def _figures(fit: Fit, seen: PosedViews, tested: PosedViews) -> dict[str, Any]:
 
 
 def _world(
-    gaussians: Gaussians, seen: PosedViews, spec: Mapping[str, Any], name: str, card: dict[str, Any]
+    gaussians: Gaussians, seen: PosedViews, spec: Mapping[str, Any], config: SplatFit, card: dict[str, Any]
 ) -> SplatWorld:
     """The world of a fit, with a walker whose eyes are as high above the floor as the recording's camera."""
     gaussians = gaussians.at(gaussians.opacities > 0.01)
     eye = seen.pose[:, :3]
-    below = Occupancy.of(gaussians).floor(eye, Walker(eye_m=0.5, step_m=0.0))
+    filled = Occupancy.of(gaussians)
+    below = filled.floor(eye, Walker(eye_m=0.5, step_m=0.0))
     tall = float((eye[:, 2] - below).median())
     body = Walker(eye_m=tall, step_m=min(0.45, 0.4 * tall)) if 0.3 < tall < 3 else Walker()
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     starts = seen.pose[:: max(len(seen) // 64, 1)]
-    made = SplatConfig(seen.camera, seen.size, body=body)
-    return SplatWorld(name, gaussians, observed, starts, made, {"game": str(spec.get("name", "")), **card})
+    made = SplatConfig(seen.camera, seen.size, body=body, inside=config.inside)
+    made = replace(made, collider=chosen_collider(filled, starts, made, config.collider))
+    return SplatWorld(config.name, gaussians, observed, starts, made, {"game": str(spec.get("name", "")), **card})
 
 
 def _save(path: Path, fit: Fit, recipe: dict[str, str]) -> None:

@@ -14,6 +14,7 @@ from ...core.errors import DatasetError
 from ...data import Dataset
 from ...data.format import INFO
 from ...space.camera import FAR_M
+from ...space.enclosure import ColliderChoice
 from ...space.files import replace_whole
 from ...space.fitting import FitConfig, PosedViews
 from ...space.lifting.network import load_lifter
@@ -42,6 +43,11 @@ class SplatFit:
     # Pixels of the longer side of pictures; larger ones are scaled down. Recordings keep their size.
     longest: int = 480
     save_every_s: float = 20.0  # Seconds between saves.
+    collider: ColliderChoice = "auto"
+    """How what stops walkers is closed: indoor, outdoor, object (see `space import --help`), or open: only what the Gaussians
+    fill. auto chooses by what surrounds the first camera."""
+    # A point in free space (x y z in metres), from which inside and outside are distinguished. Default: the first camera.
+    inside: tuple[float, float, float] | None = None
     fit: FitConfig = field(default_factory=FitConfig)
 
 
@@ -72,7 +78,7 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
         )
     views = views.at(rows)
     if not bool((views.depths(torch.arange(0, len(views), max(len(views) // 20, 1))) > 0).any()):
-        views = _with_depth(views, points, out / DEPTH_FILE, f"{data} {replace(config, fit=FitConfig())}")
+        views = _with_depth(views, points, out / DEPTH_FILE, f"{data} {depth_settings(config)}")
         if float((views.depth < FAR_M).float().mean()) < AGREEMENT:
             raise DatasetError(
                 f"the pictures of {data} do not agree on any surface: their poses are wrong, or they overlap too little, or they "
@@ -81,6 +87,11 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
         if len(views) < FEW:
             views = with_prior(views, load_lifter())
     return views, spec, left_out
+
+
+def depth_settings(config: SplatFit) -> SplatFit:
+    """The settings on which estimated depth depends; the others as they are by default."""
+    return replace(config, fit=FitConfig(), collider="auto", inside=None)
 
 
 def _with_depth(views: PosedViews, points: torch.Tensor | None, path: Path, key: str) -> PosedViews:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from ..camera import rays
+from ..camera import directions, rays
 from ..raster import Gaussians, join
 from .layers import HIDES, PictureLayers, layers_of, level_points, lowest_level, of_pixels
 from .network import Lifter
@@ -35,14 +35,6 @@ class PanoramaLayers:
     error: torch.Tensor  # [H, W], the expected error of the distance, as a share of it
     view: torch.Tensor  # [H, W], the view that weighs most, -1 where none sees
     height_m: float
-
-
-def directions(height: int) -> torch.Tensor:
-    """Unit vectors [H, 2H, 3] through the pixels of a panorama: x forward in its middle, y left, z up."""
-    lon = math.pi * (1 - (torch.arange(2 * height) + 0.5) / height)
-    lat = math.pi * (0.5 - (torch.arange(height) + 0.5) / height)[:, None]
-    level = lat.cos()
-    return torch.stack([level * lon.cos(), level * lon.sin(), lat.sin().expand(height, 2 * height)], -1)
 
 
 def view_turns() -> list[torch.Tensor]:

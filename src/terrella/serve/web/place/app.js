@@ -102,7 +102,7 @@ function run({ drawing, source, story, solid: first }) {
   function take(scene) {
     drawing.set(scene, seen.stands);
     sorter.set(scene);
-    solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : Solid.of(scene, world.samples);
+    solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : world.closed && !story.edits.some((edit) => edit.do === 'merge') ? first.edited(source, scene, world.samples) : Solid.of(scene, world.samples);
     map.layer = null;
     seen.sorted = '';
     $('what').textContent = `${seen.stands > 1 ? `${scene.length.toLocaleString('en')} of ${world.count.toLocaleString('en')}` : scene.length.toLocaleString('en')} Gaussians${made}`;

@@ -2,7 +2,7 @@
 
 import { axesOf } from './draw.js';
 
-const SOLID = 0.3, FEWEST = 6, PARTS = 6, DEEPEST = 8, MOST_CELLS = 24e6;
+const SOLID = 0.3, FEWEST = 6, PARTS = 6, DEEPEST = 8, MOST_CELLS = 24e6, LEFT_OUT = [0.001, 0.005, 0.02];
 
 const between = (sorted, at) => sorted[Math.floor(at)] + (at % 1) * (sorted[Math.ceil(at)] - sorted[Math.floor(at)]);
 
@@ -22,19 +22,34 @@ export class Solid {
     return new Solid(origin, cell, size, solid, top);
   }
 
-  /** Read off Gaussians: `samples` [n][3] are points of each that are looked at. */
-  static of(scene, samples, cell = 0.1) {
+  /** This after an edit: where what Gaussians fill has changed between two scenes, as after it. */
+  edited(before, after, samples) {
+    const [was, is] = [before, after].map((scene) => Solid.of(scene, samples, this.cell, this)), solid = this.solid.slice(), top = this.top.slice();
+    for (let k = 0; k < solid.length; k += 1) if (was.solid[k] !== is.solid[k]) [solid[k], top[k]] = [is.solid[k], is.top[k]];
+    return new Solid(this.origin, this.cell, this.size, solid, top);
+  }
+
+  /** Fills in the corners of a grid around some of the means, and its size; returns the side of its cells. */
+  static #bounds(some, means, low, high, size, cell) {
+    const sorted = [0, 1, 2].map((a) => Float32Array.from(some, (k) => means[3 * k + a]).sort()), last = some.length - 1;
+    let side = cell;
+    for (const share of LEFT_OUT) {
+      for (let a = 0; a < 3; a += 1) [low[a], high[a]] = [between(sorted[a], share * last) - 0.5, between(sorted[a], (1 - share) * last) + 0.5];
+      side = Math.cbrt(((high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])) / MOST_CELLS);
+      if (side <= cell) break;
+    }
+    side = Math.max(cell, side);
+    for (let a = 0; a < 3; a += 1) size.push(Math.max(1, Math.ceil((high[a] - low[a]) / side)));
+    return side;
+  }
+
+  /** Read off Gaussians: `samples` [n][3] are points of each that are looked at; on the cells of another, `grid`, if it is given. */
+  static of(scene, samples, cell = 0.1, grid = null) {
     const some = [];
     for (let k = 0; k < scene.length; k += 1) if (scene.opacities[k] > SOLID) some.push(k);
-    if (!some.length) return new Solid([0, 0, 0], cell, [1, 1, 1], new Uint8Array(1), new Float32Array(1));
-    const { means } = scene, low = [], high = [], size = [];
-    for (let a = 0; a < 3; a += 1) {
-      const sorted = Float32Array.from(some, (k) => means[3 * k + a]).sort(), at = (share) => between(sorted, share * (sorted.length - 1));
-      low.push(at(0.001) - 0.5);
-      high.push(at(0.999) + 0.5);
-    }
-    cell = Math.max(cell, Math.cbrt(((high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])) / MOST_CELLS));
-    for (let a = 0; a < 3; a += 1) size.push(Math.max(1, Math.ceil((high[a] - low[a]) / cell)));
+    if (!some.length && !grid) return new Solid([0, 0, 0], cell, [1, 1, 1], new Uint8Array(1), new Float32Array(1));
+    const { means } = scene, [low, size] = grid ? [grid.origin, grid.size] : [[], []], high = [];
+    if (!grid) cell = Solid.#bounds(some, means, low, high, size, cell);
     const count = new Float32Array(size[0] * size[1] * size[2]), top = new Float32Array(count.length);
     for (const k of some) {
       const m = axesOf(scene, k), s = [0, 1, 2].map((a) => Math.min(scene.scales[3 * k + a], 1)).sort((x, y) => x - y);
@@ -63,8 +78,8 @@ export class Solid {
   holds(x, y, z) { const k = this.at(x, y, z); return k >= 0 && this.solid[k] === 1; }
 
   /** Whether a body whose eye is there stands in something. */
-  blocked([x, y, z], { radius_m: radius, eye_m: eye, step_m: step, head_m: head }) {
-    const low = -eye + step, levels = Math.max(2, Math.ceil((head - low) / this.cell) + 1);
+  blocked([x, y, z], { radius_m: wide, eye_m: eye, step_m: step, head_m: head }) {
+    const radius = Math.max(wide - 0.5 * this.cell, 0.5 * wide), low = -eye + step, levels = Math.max(2, Math.ceil((head - low) / this.cell) + 1);
     for (let turn = 0; turn < 9; turn += 1) {
       const dx = turn < 8 ? radius * Math.cos((turn * Math.PI) / 4) : 0, dy = turn < 8 ? radius * Math.sin((turn * Math.PI) / 4) : 0;
       for (let level = 0; level < levels; level += 1) if (this.holds(x + dx, y + dy, z + low + ((head - low) * level) / (levels - 1))) return true;

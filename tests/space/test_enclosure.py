@@ -1,0 +1,100 @@
+"""Colliders of places of which only Gaussians are known: holes, edges, haze, and what counts as indoors."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from terrella import load
+from terrella.cli import main
+from terrella.space.enclosure import enclosed, kind_of_place
+from terrella.space.files import write_scene
+from terrella.space.occupancy import Occupancy, Walker
+from terrella.space.raster import Gaussians, join
+from terrella.space.raster.gaussians import plain_sh
+from terrella.worlds.splat import SplatWorld
+
+BODY, EYE = Walker(), torch.tensor([[2.0, 2.0, 1.6]])
+
+
+def slab(low, high, step=0.08) -> Gaussians:
+    """Round Gaussians all over a box."""
+    axes = [torch.arange(a, b + 1e-6, step) for a, b in zip(low, high)]
+    means = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    count = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4)
+    return Gaussians(
+        means, quats, torch.full((count, 3), 0.05), torch.full((count,), 0.95), plain_sh(torch.rand(count, 3))
+    )
+
+
+def without(place: Gaussians, low, high) -> Gaussians:
+    inside = ((place.means > torch.tensor(low)) & (place.means < torch.tensor(high))).all(1)
+    return place.at(~inside)
+
+
+@pytest.fixture(scope="module")
+def room() -> Gaussians:
+    """A room of 4 x 4 x 2.6 m with a hole in its floor, and without its wall at x = 4."""
+    floor, roof = without(slab((0, 0, 0), (4, 4, 0)), (2.6, 2.6, -1), (3.3, 3.3, 1)), slab((0, 0, 2.6), (4, 4, 2.6))
+    walls = [slab((0, 0, 0), (0, 4, 2.6)), slab((0, 0, 0), (4, 0, 2.6)), slab((0, 4, 0), (4, 4, 2.6))]
+    return join([floor, roof, *walls])
+
+
+def walked(place: Occupancy, way, steps=120) -> torch.Tensor:
+    here = EYE
+    for _ in range(steps):
+        here = place.walk(here, torch.tensor([[*way, 0.0]]), BODY)
+    return here[0]
+
+
+def test_a_floor_goes_on_over_holes_and_ends_a_metre_beyond_what_is_known(room):
+    plain, closed = (enclosed(room, EYE, kind, BODY) for kind in ("open", "indoor"))
+    over = torch.tensor([[2.95, 2.95, 1.6]])
+    assert plain.surface(over, BODY).isnan() and closed.surface(over, BODY).abs() < 0.11
+    assert walked(plain, (0.1, 0))[0] > 10  # out of the open side, into nothing
+    assert 4.1 < walked(closed, (0.1, 0))[0] < 5.2
+    assert closed.surface(torch.tensor([[4.3, 2.0, 1.6]]), BODY).abs() < 0.11
+    for way in ((-0.1, 0), (0, 0.1), (0, -0.1)):
+        assert torch.allclose(walked(plain, way), walked(closed, way), atol=0.11)
+
+
+def test_soft_gaussians_do_not_fill_the_room(room):
+    haze = slab((0.5, 0.5, 0.3), (3.5, 3.5, 2.2), 0.3)
+    thin = {"opacities": torch.full_like(haze.opacities, 0.32), "scales": haze.scales * 0.6}
+    soft = join([room, replace(haze, **thin)])
+    spots = 0.6 + 2.8 * torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
+    spots[:, 2] = 1.6
+    said = {kind: enclosed(soft, EYE, kind, BODY).blocked(spots, BODY).float().mean() for kind in ("open", "indoor")}
+    assert said["open"] > 0.3 and said["indoor"] < 0.02
+
+
+def test_what_no_flood_reaches_is_solid():
+    ends = [((1, 1, 0), (2, 2, 0)), ((1, 1, 1), (2, 2, 1)), ((1, 1, 0), (1, 2, 1))]
+    ends += [((2, 1, 0), (2, 2, 1)), ((1, 1, 0), (2, 1, 1)), ((1, 2, 0), (2, 2, 1))]
+    crate = join([slab(low, high) for low, high in ends])
+    middle = torch.tensor([[1.5, 1.5, 0.5]])
+    assert not Occupancy.of(crate).holds(middle)
+    whole = enclosed(crate, EYE, "object", BODY)
+    assert whole.holds(middle) and not whole.holds(torch.tensor([[0.75, 1.5, 0.5]]))
+    assert kind_of_place(Occupancy.of(crate), torch.tensor([1.5, 1.5, 1.6])) == "object"
+
+
+def test_auto_tells_indoors_from_outdoors(room):
+    assert kind_of_place(Occupancy.of(room), EYE[0]) == "indoor"
+    field = slab((0, 0, 0), (8, 8, 0), 0.1)
+    assert kind_of_place(Occupancy.of(field), torch.tensor([4.0, 4, 1.6])) == "outdoor"
+
+
+def test_an_imported_place_is_closed_and_a_wrong_point_is_refused(tmp_path, room, capsys):
+    write_scene(room, tmp_path / "room.ply")
+    given = ["space", "import", str(tmp_path / "room.ply"), "--out", str(tmp_path / "w")]
+    assert main([*given, "--inside", "2", "2", "1.6"]) == 0
+    assert "collider: indoor" in capsys.readouterr().out
+    world = load(tmp_path / "w")
+    assert isinstance(world, SplatWorld) and world.config.collider == "indoor"
+    assert (world.starts[0, :2] - 2).norm() < 0.5
+    assert 4.1 < walked(world.occupancy, (0.1, 0))[0] < 5.2
+    assert main([*given, "--collider", "open"]) == 0 and load(tmp_path / "w").config.collider == "open"
+    assert main([*given, "--inside", "90", "2", "1.6"]) == 2
+    assert "--inside 90 2 1.6 is not in free space" in capsys.readouterr().err
