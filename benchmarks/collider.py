@@ -76,14 +76,17 @@ def floor_places(rooms: torch.Tensor) -> tuple[torch.Tensor, tuple[int, int]]:
         for k in (0, 1)
     ]
     x, y = torch.meshgrid(*axes, indexing="ij")
-    return torch.stack([x.flatten(), y.flatten(), torch.full_like(x, WALKER.eye_m).flatten()], 1), tuple(x.shape)
+    return torch.stack([x.flatten(), y.flatten(), torch.full_like(x, WALKER.eye_m).flatten()], 1), (
+        len(axes[0]),
+        len(axes[1]),
+    )
 
 
 def reached(collider: Collider, places: torch.Tensor, size: tuple[int, int], start: torch.Tensor) -> np.ndarray:
     """Which of the places a body comes to from `start` over the floor: bool [X, Y]."""
     level = collider.surface(places, WALKER)
     free = level.isfinite() & (level.abs() < WALKER.step_m) & ~collider.blocked(places, WALKER)
-    parts = ndimage.label(free.view(size).numpy())[0]
+    parts: np.ndarray = ndimage.label(free.view(size).numpy())[0]  # pyright: ignore
     here = parts.flatten()[(places - start).norm(dim=1).argmin()]
     return (parts == here) & (here > 0)
 

@@ -499,7 +499,12 @@ def serving():
 
     def start(app) -> str:
         listener, ready, address = open_port("127.0.0.1", 0), threading.Event(), []
-        server = make_server(app, listener, "127.0.0.1", None, lambda url: (address.append(url), ready.set()), False)
+
+        def opened(url: str) -> None:
+            address.append(url)
+            ready.set()
+
+        server = make_server(app, listener, "127.0.0.1", None, opened, False)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         assert ready.wait(20)

@@ -26,6 +26,7 @@ from terrella.space.lifting.panorama import (
 )  # fmt: skip
 from terrella.space.raster import rasterise
 from terrella.space.raster.move import quaternion_of
+from terrella.worlds.splat import SplatWorld
 
 SIZE = torch.tensor([3.0, 2.0, 1.2])  # half a room, in metres
 
@@ -112,7 +113,7 @@ def test_panoramas_go_in_and_come_out(tmp_path, capsys):
     facts = json.loads(capsys.readouterr().out)
     assert facts["panorama"] and "2:1" in facts["notes"][0] and facts["height_m"] == 1.6
     world = terrella.load(tmp_path / "place")
-    assert len(world.starts) == 8 and world.card["panorama"] == "all.png"
+    assert isinstance(world, SplatWorld) and len(world.starts) == 8 and world.card["panorama"] == "all.png"
     small = terrella.LiftSpaceConfig(longest=128)
     assert terrella.generate_place(tmp_path / "again", panorama=tmp_path / "all.png", config=small).facts["panorama"]
     file = str(tmp_path / "out.png")

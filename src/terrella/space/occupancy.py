@@ -76,8 +76,8 @@ class Occupancy:
         """Whether walkers at `place` [B, 3] overlap a solid cell: bool [B]. Cells as low as a step do not count."""
         angle = torch.arange(8) * (math.pi / 4)
         radius = max(
-            body.radius_m - 0.5 * self.cell_m, 0.5 * body.radius_m
-        )  # surfaces lie in the middle of cells on average
+            body.radius_m - 0.25 * self.cell_m, 0.5 * body.radius_m
+        )  # surfaces lie within cells: no body is deeper than 10 cm
         ring = torch.cat([torch.stack([angle.cos(), angle.sin()], 1) * radius, torch.zeros(1, 2)])
         low, high = -body.eye_m + body.step_m, body.head_m
         levels = torch.linspace(low, high, max(2, math.ceil((high - low) / self.cell_m) + 1))

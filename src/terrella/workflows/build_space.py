@@ -60,8 +60,8 @@ class ImportSpaceConfig:
     """How what stops walkers is closed: indoor, outdoor (also without walls: floors go on, the inside of things is solid), object
     (solid, on a level floor), or open: only what the Gaussians fill. auto chooses by what surrounds the start."""
     inside: tuple[float, float, float] | None = None
-    """A point in free space (x y z in metres, z up) where one begins, inside as against outside. Default: the
-    free place nearest to the middle."""
+    """A point in free space (x y z in metres, z up) where one begins, and the flood fill, too. Default: the free
+    place nearest to the middle."""
 
 
 def fit_space(

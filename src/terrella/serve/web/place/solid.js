@@ -79,7 +79,7 @@ export class Solid {
 
   /** Whether a body whose eye is there stands in something. */
   blocked([x, y, z], { radius_m: wide, eye_m: eye, step_m: step, head_m: head }) {
-    const radius = Math.max(wide - 0.5 * this.cell, 0.5 * wide), low = -eye + step, levels = Math.max(2, Math.ceil((head - low) / this.cell) + 1);
+    const radius = Math.max(wide - 0.25 * this.cell, 0.5 * wide), low = -eye + step, levels = Math.max(2, Math.ceil((head - low) / this.cell) + 1);
     for (let turn = 0; turn < 9; turn += 1) {
       const dx = turn < 8 ? radius * Math.cos((turn * Math.PI) / 4) : 0, dy = turn < 8 ? radius * Math.sin((turn * Math.PI) / 4) : 0;
       for (let level = 0; level < levels; level += 1) if (this.holds(x + dx, y + dy, z + low + ((head - low) * level) / (levels - 1))) return true;
