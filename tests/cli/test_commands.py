@@ -51,7 +51,7 @@ OPTIONS = {
     "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",
     "adapt": "--batch --device --from --json --keep --learning-rate --minutes --no-laws --out --seed --steps",
     "check": "--coarse --data --device --fresh --json --metres-per-pixel --out --pictures --rollouts --seed --steps --system",
-    "space lift": "--collider --eye --fov --json --longest --out --panorama",
+    "space lift": "--collider --depth --eye --fov --json --longest --out --panorama",
     "space grow": "--fill --json --seed --steps --to",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",

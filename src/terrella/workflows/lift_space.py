@@ -13,6 +13,7 @@ from PIL import Image
 from ..core.errors import DatasetError, TerrellaError
 from ..space.camera import planar_pose
 from ..space.enclosure import ColliderKind
+from ..space.lifting.depth_teacher import with_teacher
 from ..space.lifting.layers import HIDES, PictureLayers, floor_below, layers_of, to_gaussians
 from ..space.lifting.network import Lifter, load_lifter
 from ..space.lifting.panorama import PanoramaLayers, panorama_gaussians, panorama_layers, wraps
@@ -46,6 +47,8 @@ class LiftSpaceConfig:
     unless --fov is given."""
     # Height of the camera above the floor in metres, which gives the scale. Default: both estimated from the picture.
     eye: float | None = None
+    # A depth network of others for what is seen: an .onnx file, or depth-anything-v2-small (of the hub). Default: the lifter's own.
+    depth: str | None = None
     collider: ColliderKind = "indoor"
     """How what stops walkers is closed: indoor (the floor goes on for 1 m beyond what is seen, and ends there), outdoor (it goes on
     for as long as the place is), object, or open: only what the Gaussians fill."""
@@ -66,6 +69,10 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
         raise TerrellaError("--fov is for pictures of one direction, --panorama for those of all; leave one out.")
     rgb = read_picture(picture, longest=2 * config.longest)
     if config.panorama or config.fov is None and wraps(rgb):
+        if config.depth is not None:
+            raise TerrellaError(
+                "--depth is for pictures of one direction; leave it out, or give --fov for a plain picture."
+            )
         notes += (
             []
             if config.panorama
@@ -84,6 +91,10 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
     if config.fov is not None:
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
     layers = layers_of(rgb, lifter, focal, config.eye)
+    if config.depth is not None:
+        progress("running the depth network")
+        layers, agreement = with_teacher(layers, config.depth)
+        notes.append(f"depth by {config.depth}, scaled to the lifter's (correlation {agreement:.2f}).")
     doubtful = doubts(layers)
     card = {"picture": picture.name} | ({"doubts": doubtful} if doubtful else {})
     world = place_of(layers, picture.stem, card, config.collider)
