@@ -6,11 +6,12 @@ import torch
 from gymnasium import spaces
 from tests.learn.stopping import quiet
 
-from terrella.act.imitation_network import spatial_softmax
+from terrella.act.imitation_network import ImitationNetwork, spatial_softmax
 from terrella.act.teacher import Teacher
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
 from terrella.data import record
+from terrella.learn.copycat import copycat
 from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, config_of, open_demonstrations
 from terrella.sim.gymnasium import GymnasiumWorld
@@ -66,6 +67,40 @@ def test_a_teacher_without_noise_is_imitated_as_before(tmp_path):
     rows, _ = rows_of(Teacher, tmp_path / "teacher")
     valid = rows.valid.nonzero()[0]
     assert torch.allclose(rows.advised.actions[valid], rows.actions[valid], atol=1e-5)
+
+
+def test_a_policys_own_episodes_go_into_the_teachers_recording(tmp_path):
+    record(
+        GymnasiumWorld("TerrellaHome-v0"),
+        Teacher(GymnasiumWorld("TerrellaHome-v0").spec),
+        tmp_path / "both",
+        100,
+        make_rng(0),
+    )
+    rows, opened = rows_of(Random, tmp_path / "both")
+    right = (rows.advised.actions - rows.actions).abs().amax(1) < 1e-5
+    assert right[:90][rows.valid[:90]].all() and not right[110:].any()
+    place = torch.from_numpy(np.array(opened.cache.arrays["observation.place"])).reshape(-1, 1)
+    assert torch.allclose(rows.advised.actions, -place, atol=1e-5)
+
+
+def test_episodes_without_a_teacher_keep_the_actions_that_were_taken(tmp_path):
+    rows, opened = rows_of(Random, tmp_path / "random")
+    opened.cache.absent["observation.expert"] = [1]
+    first, stop = opened.cache.episodes[1]
+    advised = rows.advised
+    assert torch.equal(advised.actions[first:stop], rows.actions[first:stop])
+    assert not torch.allclose(advised.actions[:first], rows.actions[:first], atol=0.1)
+
+
+def test_a_copy_of_the_last_action_is_of_the_one_that_was_taken(tmp_path):
+    rows, _ = rows_of(Random, tmp_path / "random")
+    rows = rows.advised
+    inside = torch.from_numpy(rows.rows[rows.rows > rows.recording.start[rows.rows]])
+    truth, last = rows.actions[inside], rows.taken[inside - 1]
+    explained = 1 - (truth - last).square().mean() / (truth - truth.mean(0)).square().mean()
+    figures = copycat(ImitationNetwork(rows.config), rows, 10_000)
+    assert abs(figures["held_out_copy_last"] - float(explained)) < 1e-3
 
 
 def test_spatial_softmax_finds_a_dot_between_two_pixels():

@@ -29,13 +29,11 @@ def copycat(network: ImitationNetwork, rows: DemonstrationRows, count: int) -> d
         out = out if batch.requested is None else out[batch.requested]
         noise = torch.zeros(len(part), network.config.chunk * network.config.action_width, device=out.device)
         predicted.append(network.chunk(out, noise)[:, 0].cpu())
-    mine, truth, last = (
-        torch.cat(predicted),
-        rows.actions[torch.from_numpy(picked)],
-        rows.actions[torch.from_numpy(picked - 1)],
-    )
+    now, before = torch.from_numpy(picked), torch.from_numpy(picked - 1)
+    mine, truth = torch.cat(predicted), rows.actions[now]
+    last = (rows.actions if rows.taken is None else rows.taken)[before]  # which the policy could copy
     axes = network.config.actor.mode == AXES
-    change = (truth - last).abs().sum(1)
+    change = (truth - rows.actions[before]).abs().sum(1)
     changes = change > (change.quantile(1 - CHANGES) if axes else 0)
     usual = truth.mean(0).expand_as(truth) if axes else truth.unique(dim=0, return_counts=True)
     usual = usual if isinstance(usual, torch.Tensor) else usual[0][usual[1].argmax()].expand_as(truth)

@@ -64,7 +64,8 @@ class DemonstrationRows:
     @property
     def advised(self) -> DemonstrationRows:
         """The same with the actions of a recorded teacher in the place of those that were taken, which may be noisy, or those of a
-        policy that errs (DAgger, Ross et al. 2011); itself where the recording has no channel `expert` of actions."""
+        policy that errs (DAgger, Ross et al. 2011). Episodes without a teacher keep theirs; itself where the recording has no
+        channel `expert` of actions."""
         cache, controls = self.recording.cache, self.recording.controls
         array = array_for(EXPERT, cache.arrays, cache.keys)
         if array is None or controls is None:
@@ -72,7 +73,11 @@ class DemonstrationRows:
         expert = torch.from_numpy(np.array(cache.arrays[array], np.float32)).flatten(1)
         if expert.shape[1] != len(controls.low):
             return self
-        return replace(self, actions=controls.encode(expert), taken=self.actions)
+        actions = controls.encode(expert)
+        for number in cache.absent.get(array, ()):  # where it is padding
+            alone = slice(*cache.episodes[number])
+            actions[alone] = self.actions[alone]
+        return replace(self, actions=actions, taken=self.actions)
 
     @property
     def held_out(self) -> DemonstrationRows:

@@ -78,9 +78,9 @@ def train_imitation(
     spec: Spec | None = None,
 ) -> dict[str, Any]:
     """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
-    verdict on held-out episodes. relabel: which rows are learned from, with what
-    actions; default: a recorded teacher's (channel `expert`), else those that were taken. spec: where it is to act. DatasetError
-    or TrainingError for what cannot be imitated, ActionError or ChannelError if it could not act there."""
+    verdict on held-out episodes. relabel: which rows are learned from, with what actions; default: a recorded teacher's (channel
+    `expert`), else those that were taken. spec: where it is to act. DatasetError or TrainingError for what cannot be imitated,
+    ActionError or ChannelError if it could not act there."""
     out, batch = Path(out), practice.batch or 256
     _check(practice, imitation)
     opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
