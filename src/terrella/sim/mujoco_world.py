@@ -241,7 +241,7 @@ class MujocoWorld:
         if self._device:
             given = action.to(self.device) if torch.is_tensor(action) else action
             after = self._stepped(state, self.spec.check_action(given, state.batch).to(self._dtype))
-            return after.mixed(done, state).replace(reward=after["reward"] * ~done)
+            return after.mixed(done, state).replace(reward=after["reward"].masked_fill(done, 0.0))
         ctrl = self.spec.check_action(action, state.batch).double()
         if done.all():
             return state.replace(reward=torch.zeros(state.batch))
