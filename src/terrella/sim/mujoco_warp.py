@@ -74,7 +74,8 @@ class WarpStepper(Stepper):
         if graph is None:
             self._run(data, steps)
         else:
-            self._warp.capture_launch(graph, stream=self._warp.stream_from_torch(torch.cuda.current_stream(physics.device)))
+            stream = torch.cuda.current_stream(physics.device)
+            self._warp.capture_launch(graph, stream=self._warp.stream_from_torch(stream))
         after = torch.cat([time[:, None], *parts], 1)
         return after, held["sensordata"].clone(), held["qacc_warmstart"].clone()
 

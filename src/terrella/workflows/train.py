@@ -58,8 +58,9 @@ def adapt(
     keep: str | Path | None = None,
     progress: Progress = silent,
 ) -> TrainResult:
-    """Adapts the latent world named `world` to the body or camera of the recording `data`. keep: a recording that it was trained
-    on, of which half of each batch is made. The facts have the open-loop errors before and after; the run is in `out`."""
+    """Adapts the world named `world`, a latent one or one of frames alone, to the body or camera of the recording `data`. keep: a
+    recording that it was trained on, of which half of each batch is made. The facts have the open-loop errors before and after;
+    the run is in `out`."""
     settings, opened = config or AdaptConfig(), load_named(world, "cpu")
     return run_recipe(lambda report: adapted(opened, data, out, settings, report, keep), progress, run=out)
 

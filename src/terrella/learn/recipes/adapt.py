@@ -26,11 +26,11 @@ class AdaptConfig:
 
     minutes: float = 10.0  # Minutes of training, earlier runs included.
     # Training steps. Training ends after these or after --minutes, whichever comes first. Default: 4000, with pictures 2500, of a
-    # world that draws frames 8000.
+    # world that draws frames 8000, on a GPU 60000.
     steps: int | None = None
     # Peak learning rate. Default: 5e-4, of a world that draws frames 3e-3.
     learning_rate: float | None = None
-    # Clips per step; with --keep half of them are of that recording. Default: 128, with pictures 32, of frames 8.
+    # Clips per step; with --keep half of them are of that recording. Default: 128, with pictures 32, of frames 8, on a GPU 64.
     batch: int | None = None
     # --no-laws: leave the laws of physics out of the loss. They are a part of it where the recording describes its bodies.
     laws: bool = True
@@ -46,8 +46,9 @@ def adapt(
     `errors` has, of each recording, the world's open-loop error on held-out episodes by step, before and after, as a share of
     copy-last's: of latents, or the squared error of frames. TrainingError for a world that cannot go on learning; DatasetError for
     a recording with other channels or actions."""
-    if config.minutes <= 0 or (config.steps is not None and config.steps < 1):
-        raise TrainingError("--minutes is more than 0, and --steps 1 or more.")
+    rate, counts = config.learning_rate, [one for one in (config.steps, config.batch) if one is not None]
+    if config.minutes <= 0 or min(counts, default=1) < 1 or (rate is not None and rate <= 0):
+        raise TrainingError("--minutes and --learning-rate are more than 0, and --steps and --batch 1 or more.")
     if isinstance(world, LearnedWorld):
         settings = replace(
             settings_of(world), hours=config.minutes / 60, steps=config.steps, batch=config.batch, seed=config.seed,
