@@ -70,9 +70,9 @@ def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
     world, old, new = made
     with pytest.raises(TrainingError, match="doom-maze is a world with depth and poses"):
         adapt(terrella.load("doom-maze"), new, tmp_path / "run", SHORT, quiet)
-    for wrong in ({"minutes": 0}, {"batch": 0}, {"batch": -2}, {"learning_rate": -1.0}):
+    for wrong in (AdaptConfig(minutes=0), AdaptConfig(batch=0), AdaptConfig(batch=-2), AdaptConfig(learning_rate=-1.0)):
         with pytest.raises(TrainingError, match="--minutes and --learning-rate are more than 0"):
-            adapt(world, new, tmp_path / "run", AdaptConfig(**wrong), quiet)
+            adapt(world, new, tmp_path / "run", wrong, quiet)
     with pytest.raises(DatasetError, match=r"state of 2; .* state of 3"):
         adapt(world, heavier(tmp_path / "wide", width=3), tmp_path / "run", SHORT, quiet)
     with pytest.raises(DatasetError, match="20 steps a second, and latent 10"):
