@@ -80,8 +80,7 @@ def test_it_goes_on_from_the_world_and_measures_both_recordings(made, tmp_path, 
 
 
 @pytest.mark.slow
-def test_it_learns_the_other_camera_and_forgets_less_where_it_rehearses(made, tmp_path, monkeypatch):
-    monkeypatch.setattr(adapt_frames, "ROLLOUTS", 16)
+def test_it_learns_the_other_camera_and_forgets_less_where_it_rehearses(made, tmp_path):
     _, old, new = made
     train_video(old, tmp_path / "old", replace(TINY, steps=400), quiet)
     world, many = load_world(tmp_path / "old" / "world"), replace(FEW, steps=400)
