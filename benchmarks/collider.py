@@ -1,8 +1,8 @@
 """Measures the collider that is read off Gaussians where walls are known: rooms of `space build` of which only Gaussians are kept.
 
-python benchmarks/collider.py [--walks 1000] [--steps 120] [--fit-steps 600]
+python benchmarks/collider.py [--walks 1000] [--steps 240] [--fit-steps 1000]
 
-Exported: the room as a .ply, read again. Sparse: 15,000 Gaussians. Fitted: 80 pictures of 192 x 144 pixels with depth, as
+Exported: the room as a .ply, read again. Sparse: 15,000 Gaussians. Fitted: 100 pictures of 192 x 144 pixels with depth, as
 `space fit` fits a recording. Agreement: of places 10 cm apart on the floor, also 1 m around the rooms, the share at which the
 collider and the layout's boxes agree whether a body comes there from the start. Walks: how many random walks come deeper than
 10 cm into a wall, and how many leave the rooms (more than 0.3 m beyond their walls, or below the floor).

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,6 +10,7 @@ from terrella import load
 from terrella.cli import main
 from terrella.space.enclosure import enclosed, kind_of_place
 from terrella.space.files import write_scene
+from terrella.space.kernels_numba.flood import floors
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import Gaussians, join
 from terrella.space.raster.gaussians import plain_sh
@@ -41,8 +43,8 @@ def room() -> Gaussians:
     return join([floor, roof, *walls])
 
 
-def walked(place: Occupancy, way, steps=120) -> torch.Tensor:
-    here = EYE
+def walked(place: Occupancy, way, steps=120, start=EYE) -> torch.Tensor:
+    here = start
     for _ in range(steps):
         here = place.walk(here, torch.tensor([[*way, 0.0]]), BODY)
     return here[0]
@@ -57,6 +59,29 @@ def test_a_floor_goes_on_over_holes_and_ends_a_metre_beyond_what_is_known(room):
     assert closed.surface(torch.tensor([[4.3, 2.0, 1.6]]), BODY).abs() < 0.11
     for way in ((-0.1, 0), (0, 0.1), (0, -0.1)):
         assert torch.allclose(walked(plain, way), walked(closed, way), atol=0.11)
+
+
+@pytest.mark.parametrize("high_m", [0.5, 1.0, 2.4])
+def test_a_floor_lies_where_it_is_wherever_above_it_one_looks_from(room, high_m):
+    deep = join([room, slab((5, 5, -3), (6, 6, -3))])  # the grid goes on below the floor
+    closed = enclosed(deep, torch.tensor([[2.0, 2.0, high_m]]), "indoor", BODY)
+    assert closed.surface(torch.tensor([[2.95, 2.95, 1.6]]), BODY).abs() < 0.11
+    assert 4.1 < walked(closed, (0.1, 0))[0] < 5.2
+
+
+def test_one_comes_down_from_a_table_and_into_the_room():
+    table, floor = slab((1.5, 1.5, 0.75), (2.5, 2.5, 0.75)), slab((0, 0, 0), (6, 6, 0))
+    sides = [slab((0, 0, 0), (0, 6, 2.9)), slab((6, 0, 0), (6, 6, 2.9)), slab((0, 0, 2.9), (6, 6, 2.9))]
+    closed = enclosed(join([table, floor, *sides]), torch.tensor([[2.0, 2.0, 2.35]]), "indoor", BODY)
+    assert closed.surface(torch.tensor([[3.2, 2.0, 2.35]]), BODY).abs() < 0.11
+    assert walked(closed, (0.1, 0), start=torch.tensor([[2.0, 2.0, 2.35]]))[0] > 5.3
+
+
+def test_floors_of_a_large_place_take_little_memory():
+    field = np.zeros((1500, 1500, 6), bool)
+    field[:, :, 1] = True
+    level, away = floors(field, np.array([700, 700, 1]), 2, 2, 3, 1500)  # was 27 GB
+    assert (level == 1).all() and not away.any()
 
 
 def test_soft_gaussians_do_not_fill_the_room(room):

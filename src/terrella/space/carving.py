@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from .camera import directions
-from .flooring import floored
+from .flooring import floored, standing
 from .occupancy import Occupancy, Walker
 from .raster import Gaussians, rasterise
 from .walkable import spread_out, walkable
@@ -40,7 +40,7 @@ def carved(place: Occupancy, gaussians: Gaussians, eyes: torch.Tensor, body: Wal
             free |= _look(place, filled, gaussians, eye, hits, height)
         place = replace(place, solid=filled & ~free)
         walked = floored(place, first[0], body, math.inf)
-        eyes = torch.cat([first, walkable(walked, first, body, PLACES)])
+        eyes = torch.cat([first, walkable(walked, standing(place, first[0], body)[None], body, PLACES)])
     top = torch.where(hits > 0, height / hits.clamp_min(1), place.top.flatten()).view_as(filled)
     return replace(place, top=top)
 

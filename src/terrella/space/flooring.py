@@ -9,13 +9,23 @@ import torch
 from .kernels_numba.flood import floors
 from .occupancy import Occupancy, Walker
 
-DROP_M = 0.6  # what lies deeper below the last floor is no floor
+DROP_M = 1.2  # what lies deeper below the last floor is no floor; one comes down from tables
+
+
+def standing(place: Occupancy, eye: torch.Tensor, body: Walker) -> torch.Tensor:
+    """The eye [3] of a body that stands on the floor under the point `eye` [3], which may be higher or lower than the body's eye."""
+    near = place.surface(eye[None], body)
+    if bool((near - (eye[2] - body.eye_m)).abs() < DROP_M):
+        return eye
+    below = place.surface(eye[None], replace(body, eye_m=0.2, step_m=0.0))
+    return eye if bool(below.isnan()) else torch.cat([eye[:2], below + body.eye_m])
 
 
 def floored(place: Occupancy, inside: torch.Tensor, body: Walker, beyond_m: float) -> Occupancy:
-    """The grid with floor where a body that walks from `inside` [3], the place of its eye, finds none: as high as the last floor,
-    for up to `beyond_m`; there, and at the end of the grid, an invisible wall stands."""
-    cell, feet = place.cell_m, place.cell_of(inside - torch.tensor([0.0, 0.0, body.eye_m]))
+    """The grid with floor where a body that walks from below the point `inside` [3] finds none: as high as the last floor, for up
+    to `beyond_m`; there, and at the end of the grid, an invisible wall stands."""
+    eye = standing(place, inside, body)
+    cell, feet = place.cell_m, place.cell_of(eye - torch.tensor([0.0, 0.0, body.eye_m]))
     solid, top = place.solid.numpy().copy(), place.top.numpy().copy()
     up, tall = math.floor(body.step_m / cell), math.ceil((body.eye_m + body.head_m) / cell)
     beyond = round(min(beyond_m / cell, max(solid.shape)))

@@ -74,14 +74,15 @@ def floors(solid, feet, up, down, tall, beyond):
     `up`."""
     level = np.full(solid.shape[:2], -1, np.int32)
     away = np.zeros(solid.shape[:2], np.int32)
-    queue = np.zeros((solid.shape[0] * solid.shape[1] * (beyond + 2), 2), np.int32)
+    waits = np.zeros(solid.shape[:2], np.bool_)  # columns that are in the queue, a ring
+    queue = np.zeros((solid.shape[0] * solid.shape[1] + 1, 2), np.int32)
     i, j = feet[0], feet[1]
     k = _highest(solid[i, j], feet[2] + up, feet[2] - down)
     level[i, j], away[i, j] = (k, 0) if k >= 0 else (feet[2], 1)
-    queue[0, 0], queue[0, 1], count, first = i, j, 1, 0
-    while first < count:
+    queue[0, 0], queue[0, 1], last, first = i, j, 1, 0
+    while first != last:
         i, j = queue[first]
-        first += 1
+        first, waits[i, j] = (first + 1) % len(queue), False
         for axis in range(2):
             for way in (-1, 1):
                 a, b = i + way * (1 - axis), j + way * axis
@@ -96,6 +97,7 @@ def floors(solid, feet, up, down, tall, beyond):
                 if solid[a, b, k + 1 + up : k + 1 + tall].any():
                     continue
                 level[a, b], away[a, b] = k, far
-                queue[count, 0], queue[count, 1] = a, b
-                count += 1
+                if not waits[a, b]:
+                    queue[last, 0], queue[last, 1], waits[a, b] = a, b, True
+                    last = (last + 1) % len(queue)
     return level, away
