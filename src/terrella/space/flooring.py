@@ -13,7 +13,7 @@ DROP_M = 1.2  # what lies deeper below the last floor is no floor; one comes dow
 
 
 def standing(place: Occupancy, eye: torch.Tensor, body: Walker) -> torch.Tensor:
-    """The eye [3] of a body that stands on the floor under the point `eye` [3], which may be higher or lower than the body's eye."""
+    """The eye [3] of a body that stands on the floor under the point `eye` [3], at any height above it."""
     near = place.surface(eye[None], body)
     if bool((near - (eye[2] - body.eye_m)).abs() < DROP_M):
         return eye
