@@ -69,3 +69,21 @@ def test_lengths_beyond_the_steps_are_refused(tmp_path):
     saved(tmp_path / "a.npz", {"obs": STATE, "actions": ACTION, "lengths": np.array([6, 7, 6, 5])})
     with pytest.raises(DatasetError, match="'lengths'.*does not fit its 6 steps"):
         open_source(tmp_path / "a.npz")
+
+
+def test_a_row_for_each_step_is_no_stack_of_episodes(tmp_path):
+    """Two actions beside three or two numbers observed are no two steps of an episode."""
+    for name, count in (("a", 3), ("b", 2)):
+        saved(tmp_path / f"{name}.npz", {"obs": np.ones((20, count), np.float32), "actions": np.ones((20, 2))})
+        source = open_source(tmp_path / f"{name}.npz", fps=10)
+        assert not any("episode_lengths" in note for note in source.notes) and len(list(source.takes())) == 1
+
+
+def test_no_episodes_and_bounds_before_the_first_row_are_refused_in_a_sentence(tmp_path):
+    saved(tmp_path / "a.npz", {"obs": STATE[:0], "actions": ACTION[:0], "lengths": np.zeros(0, int)})
+    with pytest.raises(DatasetError, match="0 observations"):
+        open_source(tmp_path / "a.npz")
+    bounds = {"episode_ends": np.array([-5, 9, 20])}
+    saved(tmp_path / "b.npz", {"obs": np.ones((20, 3)), "actions": np.ones((20, 2)), **bounds})
+    with pytest.raises(DatasetError, match="'episode_ends'.*does not fit"):
+        open_source(tmp_path / "b.npz")

@@ -200,7 +200,7 @@ def _ends(stored: Mapping[Place, Array], count: int, where: str) -> np.ndarray:
             raise DatasetError(f"'{head}' in {where} has {has}: store episodes one after another, or a file each.")
         if starts or head in (*_ENDS, *LENGTHS):
             values = array.read(0, array.shape[0]).reshape(-1).astype(np.int64)
-            values = values[values > 0] if head in _ENDS else values  # "cu_seqlens" begins with 0
+            values = values[1:] if head in _ENDS and (values[:1] == 0).all() else values  # "cu_seqlens" begins with 0
             stops = np.cumsum(values) if head in LENGTHS else values + (values.max(initial=0) == count - 1)
             stops = np.append(values[1:], count) if starts else stops
             if (np.diff(stops, prepend=0) < 1).any() or stops.max(initial=0) > count:

@@ -61,13 +61,18 @@ def _stack(stored: Mapping[Place, Array]) -> tuple[int, int] | None:
         for roles in ((rows.ACTION,), (rows.OBSERVATION,), (rows.DONE, rows.TRUNCATED, "marks"))
     )
     lead = next((shape[:2] for shape in acted if len(shape) >= 3), None)
-    beside = [shape[:2] for shape in (*flags, *observed)]
+    beside = [shape[:2] for shape in (*flags, *(one for one in observed if len(one) > 2 or _says_lengths(stored, one)))]
     if lead is None and acted and len(acted[0]) == 2:  # one number an action
         lead = next((acted[0] for shape in beside if shape in (acted[0], (acted[0][0], acted[0][1] + 1))), None)
-    if lead is None or lead[1] < 2:
+    if lead is None or lead[0] < 1 or lead[1] < 2:
         return None
     fits = (lead, (lead[0], lead[1] + 1))  # one more observation than actions
     return (lead[0], lead[1]) if {shape[:2] for shape in (*acted, *observed)} <= {*fits} else None
+
+
+def _says_lengths(stored: Mapping[Place, Array], shape: tuple[int, ...]) -> bool:
+    """Whether an array has the lengths of shape[0] episodes: numbers [E, T] may as well be a row for each step."""
+    return any(place[0] in _LENGTHS and array.shape[:1] == shape[:1] for place, array in stored.items())
 
 
 def _role(head: str) -> str | None:
@@ -80,7 +85,7 @@ def _lengths(stored: Mapping[Place, Array], shape: tuple[int, int], where: str) 
     marked = {str(place[0]): array for place, array in stored.items() if len(place) == 1 and array.is_numeric}
     for name in _LENGTHS:
         if name in marked and np.prod(marked[name].shape) == marked[name].shape[0] == episodes:
-            lengths = marked[name].read(0, episodes).reshape(-1).astype(np.int64)
+            lengths = np.nan_to_num(marked[name].read(0, episodes).reshape(-1)).astype(np.int64)
             if lengths.min() < 1 or lengths.max() > steps:
                 raise DatasetError(
                     f"'{name}' in {where} does not fit its {steps} steps an episode; mend it, or drop it."
