@@ -82,7 +82,7 @@ def test_a_row_for_each_step_is_no_stack_of_episodes(tmp_path):
 def test_no_episodes_and_bounds_before_the_first_row_are_refused_in_a_sentence(tmp_path):
     saved(tmp_path / "a.npz", {"obs": STATE[:0], "actions": ACTION[:0], "lengths": np.zeros(0, int)})
     with pytest.raises(DatasetError, match="0 observations"):
-        open_source(tmp_path / "a.npz")
+        list(open_source(tmp_path / "a.npz", fps=10).takes())
     bounds = {"episode_ends": np.array([-5, 9, 20])}
     saved(tmp_path / "b.npz", {"obs": np.ones((20, 3)), "actions": np.ones((20, 2)), **bounds})
     with pytest.raises(DatasetError, match="'episode_ends'.*does not fit"):
