@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from terrella import load
 from terrella.cli import main
 from terrella.core.errors import DatasetError
 from terrella.space.camera import FAR_M, rotation
@@ -20,6 +21,7 @@ from terrella.space.pictures.reading import blurred, read_picture, sharpness
 from terrella.space.pictures.transforms import read_transforms
 from terrella.space.raster import rasterise
 from terrella.space.stereo import with_depth
+from terrella.worlds.splat import SplatWorld
 
 from .test_fitting import room, views
 
@@ -89,6 +91,11 @@ def test_posed_pictures_become_views_and_a_world(tmp_path, capsys):
     before = (tmp_path / "run" / "resume.safetensors").read_bytes()
     assert main([*fit, "--out", str(tmp_path / "run"), "--scale", "2"]) == 0
     assert (tmp_path / "run" / "resume.safetensors").read_bytes() == before
+    again = [*fit, "--out", str(tmp_path / "run"), "--scale", "2", "--collider"]
+    for kind in ("indoor", "open"):  # of a finished fit, too
+        assert main([*again, kind]) == 0
+        world = load(tmp_path / "run")
+        assert isinstance(world, SplatWorld) and world.config.collider == kind
 
 
 def test_few_pictures_take_lifted_depth_and_keep_enough_out_for_an_interval(tmp_path, capsys, monkeypatch):

@@ -79,7 +79,7 @@ def fit_space(
         f"{facts['gaussians']:,} Gaussians from {facts['pictures']} pictures in {facts['seconds']:.0f} s",
         f"{facts['held_out']} held-out pictures: {ours:.1f} dB (+-{ours_by:.1f}); copying the nearest picture: "
         f"{copied:.1f} (+-{copied_by:.1f})",
-        f"walk in it: terrella play {facts['world']}",
+        f"walk in it: terrella play {facts['world']} (collider: {facts['collider']})",
     ]
     if left_out := facts["left_out"]:
         more = f", and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""

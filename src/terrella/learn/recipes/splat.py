@@ -18,7 +18,7 @@ from ...space.occupancy import Occupancy, Walker
 from ...space.pictures.posed import FEWEST
 from ...space.raster import Gaussians
 from ...worlds.additions import OBSERVED
-from ...worlds.checkpoint import WORLD_FILE
+from ...worlds.checkpoint import WORLD_FILE, read_about, write_about
 from ...worlds.splat import SplatConfig, SplatWorld
 from ...worlds.splat_folder import check_free, chosen_collider, save_splat
 from ..trainer import Report
@@ -88,7 +88,18 @@ def fit_splat(
         _save(out / RESUME, fit, recipe)
         card = {"data": str(data), "left_out": left_out, **figures}
         save_splat(_world(fit.gaussians, seen, spec, named, card), out / "world")
-    return {**figures, "left_out": left_out, "seconds": round(time.monotonic() - began, 1), "world": str(out / "world")}
+    elif (config.collider, config.inside) != ("auto", None):
+        _set_collider(out / "world", _world(fit.gaussians, seen, spec, named, {}).config)
+    kind = read_about(out / "world")["config"].get("collider", "open")
+    taken = {"left_out": left_out, "seconds": round(time.monotonic() - began, 1)}
+    return {**figures, **taken, "collider": kind, "world": str(out / "world")}
+
+
+def _set_collider(world: Path, config: SplatConfig) -> None:
+    """Closes the collider of a finished fit as `config` says; its edits stay."""
+    about = read_about(world)
+    about["config"] |= {"collider": config.collider, "inside": config.inside}
+    write_about(world, about)
 
 
 def _check(config: SplatFit) -> None:
