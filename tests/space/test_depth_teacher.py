@@ -16,12 +16,13 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
 
-def network(path, sides=("h", "w"), sign=1.0) -> str:
+def network(path, sides=("h", "w"), sign=1.0, words=False) -> str:
     """A network that calls the red channel inverse depth: pixel_values [1, 3, h, w] to predicted_depth [1, h, w]."""
     from onnx import TensorProto, helper, numpy_helper
 
     gives = helper.make_tensor_value_info("predicted_depth", TensorProto.FLOAT, [1, *sides])
-    takes = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, [1, 3, *sides])
+    shape = [1, 3] if words else [1, 3, *sides]
+    takes = helper.make_tensor_value_info("pixel_values", TensorProto.FLOAT, shape)
     constants = [
         numpy_helper.from_array(np.array(0), "red"),
         numpy_helper.from_array(np.array(sign, np.float32), "sign"),
@@ -77,6 +78,8 @@ def test_what_is_no_teacher_is_refused_in_one_sentence(tmp_path, capsys):
     for name, fault in (("broken.onnx", "cannot be read as ONNX"), ("absent.onnx", "there is no such file")):
         with pytest.raises(TerrellaError, match=fault):
             with_teacher(layers, str(tmp_path / name))
+    with pytest.raises(TerrellaError, match="takes no picture"):
+        inverse_depth(torch.rand(3, 30, 40), network(tmp_path / "words.onnx", words=True))
     picture = np.random.default_rng(0).integers(0, 255, (64, 128, 3), np.uint8)
     Image.fromarray(picture).save(tmp_path / "all.png")
     given = [

@@ -55,7 +55,9 @@ def inverse_depth(rgb: torch.Tensor, source: str) -> torch.Tensor:
     session = _session(source)
     height, width = rgb.shape[1:]
     share = SIDE / min(height, width)
-    wanted = session.get_inputs()[0]
+    wanted = next(iter(session.get_inputs()), None)
+    if wanted is None or len(wanted.shape) != 4:
+        raise TerrellaError(f"{source} takes no picture: its first input must be pixels [1, 3, H, W].")
     given = [side if isinstance(side, int) else None for side in list(wanted.shape)[-2:]]
     size = [fixed or max(round(side * share / MULTIPLE), 1) * MULTIPLE for fixed, side in zip(given, (height, width))]
     picture = F.interpolate(rgb[None], size, mode="bicubic", antialias=True)
