@@ -30,7 +30,8 @@ class _FusedOnCards(TorchFunctionMode):
         if func in (torch.gru_cell, F.scaled_dot_product_attention) and args[0].is_meta:
             if func is torch.gru_cell:
                 (seen, hidden), (of_seen, of_hidden, *biases) = args[:2], args[2:]
-                F.linear(seen, of_seen, *biases[:1]), F.linear(hidden, of_hidden, *biases[1:])
+                F.linear(seen, of_seen, *biases[:1])
+                F.linear(hidden, of_hidden, *biases[1:])
             self.counts.add(str(func.__name__))
             return torch.empty_like(args[1 if func is torch.gru_cell else 0])
         return func(*args, **(kwargs or {}))
