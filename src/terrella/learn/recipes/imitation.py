@@ -98,12 +98,8 @@ def train_imitation(
     feed = SizedFeed(lambda size: RandomBatches(lambda now: rows.sample(size, now.rng)), batch)
     trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
     trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
-    whose = "the teacher (channel 'expert') at what happens in" if rows.taken is not None else ""
-    card = {
-        "what": " ".join(f"A policy that imitates {whose} {recording}".split()),
-        "learned_from": str(recording),
-        "sees": list(sees),
-    }
+    whom = f"the teacher (channel 'expert') in {recording}" if rows.taken is not None else str(recording)
+    card = {"what": f"A policy that imitates {whom}", "learned_from": str(recording), "sees": list(sees)}
 
     def save() -> None:
         ImitationActor.write(network, out / RUN_SUBFOLDER, card)
