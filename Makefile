@@ -26,9 +26,9 @@ help:
 play: $(VENV)/.ready-play
 	$(BIN)/terrella play $(ARGS)
 
-# Two at a time, file by file; all files that drive a browser are one group (tests/conftest.py).
+# Two at a time, whole files, so that what a file's tests share is made once; the long ones first (tests/conftest.py).
 PYTEST = $(BIN)/python -m pytest
-RUN_TESTS = $(PYTEST) -n 2 --dist loadgroup
+RUN_TESTS = $(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(VENV)/.ready-dev
 	@sh tests/browser_setup.sh $(BIN)/python

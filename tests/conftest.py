@@ -44,18 +44,19 @@ def browser():
         chromium.close()
 
 
-@pytest.hookimpl(tryfirst=True)
+# The folders with the longest files, longest first: what comes last is short, so no worker waits long for the other.
+LONG = ("learn", "serve", "cli", "worlds", "space", "sim", "measure")
+
+
 def pytest_collection_modifyitems(items):
-    """A file is one group for xdist, files with browser tests are one group together; within a file browser tests come last."""
-    browsing = {item.path for item in items if "browser" in getattr(item, "fixturenames", ())}
+    """Files of the long folders come first, and within a file its browser tests come last."""
+    browsing = {id(item) for item in items if "browser" in getattr(item, "fixturenames", ())}
     for item in items:
-        item.add_marker(pytest.mark.xdist_group("browser" if item.path in browsing else item.path.as_posix()))
-        if "browser" in getattr(item, "fixturenames", ()):
+        if id(item) in browsing:
             item.add_marker("browser")
-    order = {path: number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
-    items.sort(
-        key=lambda item: (item.path not in browsing, order[item.path], item.get_closest_marker("browser") is not None)
-    )
+    files = {path: number for number, path in enumerate(dict.fromkeys(item.path for item in items))}
+    rank = {path: LONG.index(path.parent.name) if path.parent.name in LONG else len(LONG) for path in files}
+    items.sort(key=lambda item: (rank[item.path], files[item.path], id(item) in browsing))
 
 
 def pytest_terminal_summary(terminalreporter):
