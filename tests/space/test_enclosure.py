@@ -14,7 +14,11 @@ from terrella.space.kernels_numba.flood import floors
 from terrella.space.occupancy import Occupancy, Walker
 from terrella.space.raster import Gaussians, join
 from terrella.space.raster.gaussians import plain_sh
+from terrella.workflows.splat_places import open_splat
+from terrella.worlds import collider_file
+from terrella.worlds.collider_file import COLLIDER_FILE
 from terrella.worlds.splat import SplatWorld
+from terrella.worlds.splat_folder import write_edits
 
 BODY, EYE = Walker(), torch.tensor([[2.0, 2.0, 1.6]])
 
@@ -125,3 +129,21 @@ def test_an_imported_place_is_closed_and_a_wrong_point_is_refused(tmp_path, room
     assert isinstance(again, SplatWorld) and again.config.collider == "open"
     assert main([*given, "--inside", "90", "2", "1.6"]) == 2
     assert "--inside 90 2 1.6 is not in free space" in capsys.readouterr().err
+
+
+def test_a_collider_is_computed_once_and_anew_after_an_edit(tmp_path, room, monkeypatch):
+    write_scene(room, tmp_path / "room.ply")
+    assert main(["space", "import", str(tmp_path / "room.ply"), "--out", str(tmp_path / "w")]) == 0
+    opened = lambda: open_splat(str(tmp_path / "w")).occupancy  # noqa: E731
+    first, calls = opened(), []
+    monkeypatch.setattr(collider_file, "enclosed", lambda *given: calls.append(1) or enclosed(*given))
+    again = opened()
+    assert not calls and torch.equal(again.solid, first.solid) and torch.equal(again.origin, first.origin)
+    assert torch.equal(again.top[first.solid], first.top[first.solid]) and again.cell_m == first.cell_m
+    write_edits(tmp_path / "w", [{"select": {"sphere": [2, 2, 0, 1]}, "do": "move", "by": [0, 0, 1.0]}])
+    edited = opened()
+    assert len(calls) == 1 and not torch.equal(edited.solid, first.solid) and torch.equal(opened().solid, edited.solid)
+    write_edits(tmp_path / "w", [])
+    assert torch.equal(opened().solid, first.solid) and len(calls) == 1  # that without edits is kept beside it
+    (tmp_path / "w" / COLLIDER_FILE).write_bytes(b"damaged")
+    assert torch.equal(opened().solid, first.solid) and torch.equal(opened().solid, first.solid) and len(calls) == 2

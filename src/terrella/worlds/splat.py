@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple, final
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..core.spec import PLACES_UNIT, POSE, POSE_UNIT, WALKABLE, Camera, Spec
 from ..core.state import State
 from ..core.world import Observation
 from ..space.camera import Intrinsics, rotation, yaw
-from ..space.enclosure import ColliderKind, enclosed
+from ..space.enclosure import ColliderKind
 from ..space.fitting import resize_depth
 from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Drawing, Gaussians, rasterise
@@ -26,6 +27,7 @@ from ..space.raster.move import multiply_quaternions
 from ..space.solids import Solids
 from ..space.walkable import walkable
 from .additions import OBSERVED, Additions
+from .collider_file import kept_collider
 from .parts import check_prior, picture_of
 
 BUTTONS = ("MOVE_FORWARD", "MOVE_BACKWARD", "MOVE_LEFT", "MOVE_RIGHT", "TURN_LEFT", "TURN_RIGHT", "UP", "DOWN")
@@ -106,6 +108,7 @@ class SplatWorld:
         things = self.bodies.unique().tolist() if find_spec("mujoco") else []
         self.things = [number for number in things if number]  # the objects that are rigid bodies here
         self.added = Additions(gaussians, provenance, self.config.additions)
+        self.collider_file: Path | None = None  # where `occupancy` is kept, because it takes seconds
         self.spec = self._spec()
 
     def _spec(self) -> Spec:
@@ -151,7 +154,7 @@ class SplatWorld:
         """What the Gaussians fill, closed as `config.collider` says."""
         eyes = self.starts[:, :3]
         eyes = eyes if self.config.inside is None else torch.cat([torch.tensor([self.config.inside]), eyes])
-        return enclosed(self.gaussians, eyes, self.config.collider, self.config.body)
+        return kept_collider(self.gaussians, eyes, self.config.collider, self.config.body, self.collider_file)
 
     @cached_property
     def collider(self) -> Solids | Occupancy:

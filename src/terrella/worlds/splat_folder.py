@@ -1,4 +1,5 @@
-"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md."""
+"""A SplatWorld on disk: a folder of world.json, scene.safetensors, world.edits.jsonl, world.undone.jsonl and README.md, and
+what stops bodies, once it was computed (collider_file.py)."""
 
 import functools
 import hashlib
@@ -23,6 +24,7 @@ from ..space.occupancy import Occupancy, Walker
 from ..space.raster import Gaussians
 from .additions import INVENTED, OBSERVED
 from .checkpoint import WORLD_FILE, data_file, read_data, write_checkpoint
+from .collider_file import COLLIDER_FILE, EDITED_FILE
 from .splat import SolidBoxes, SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
@@ -102,7 +104,9 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
             SolidBoxes.of(solids, bodies),
         )  # fmt: skip
         edits = read_edits(path) if edits is None else edits
-        return _after(world, edits, merged_loader(path)) if edits else world
+        world = _after(world, edits, merged_loader(path)) if edits else world
+        world.collider_file = path / (EDITED_FILE if edits else COLLIDER_FILE)
+        return world
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
 
