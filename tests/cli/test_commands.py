@@ -396,6 +396,8 @@ def test_missing_checkpoints_to_list_are_said(capsys, tmp_path):
             RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 8 bytes"),
             "this machine has too little",
         ),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED"), "the GPU has too little memory"),
+        (RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"), "the GPU has too little memory"),
         (MemoryError(), "this machine has too little memory"),
     ],
 )

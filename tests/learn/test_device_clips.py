@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from terrella.learn import trainer as module
 from terrella.learn.device_clips import DeviceClips, DeviceGrounds
 from terrella.learn.moves import stitch_episodes
 from terrella.learn.objectives.flow_frames import DRAFTS, FlowFrames
+from terrella.learn.recipes.video_flat import FlowRecipe
 from terrella.learn.trainer import Run, Trainer
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 
@@ -70,3 +73,19 @@ def test_a_training_step_on_a_device_waits_for_nothing_and_copies_nothing(record
         parts = trainer._step(201)
     assert set(parts) == {"draft", "drawn"} and len(parts["draft"]) == ROLLOUT
     assert count.waits == 0 and count.crossings == 0 and not lists, count.by_site.most_common(9)
+
+
+def test_a_recording_that_does_not_fit_stays_on_the_cpu_which_is_said(recording, monkeypatch):  # noqa: F811
+    recipe, card = object.__new__(FlowRecipe), SimpleNamespace(device=torch.device("cuda"))
+    recipe.parts = cast(Any, SimpleNamespace(run=card, recording=recording))
+    recipe.video, recipe.objective = cast(Any, SimpleNamespace(slots=2)), cast(Any, SimpleNamespace(losses_per_batch=1))
+    recipe.begin = recipe.stitched = None
+
+    def full(*given):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr("terrella.learn.recipes.video_flat.DeviceClips", full)
+    held, fits = recipe._on_device(1e12)
+    other, half = recipe._on_device(1.0)
+    assert held is other is None and fits.endswith("GiB) does not fit into its memory: clips come from the CPU")
+    assert half.endswith("takes more than half of its memory: clips come from the CPU")

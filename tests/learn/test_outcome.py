@@ -122,7 +122,7 @@ def test_clips_go_on_with_vitals_of_their_own_and_learn_to_correct_them(learned,
     _, seen, happened, _ = learned
     always = replace(happened.config(), changes=((-1.0, 0.0),))
     outcome = FrameOutcome(always)
-    torch.nn.init.constant_(outcome.changed[0].weight, 0.0)
+    outcome.changed[0].weight = torch.nn.Parameter(torch.zeros_like(torch.as_tensor(outcome.changed[0].weight)))
     outcome.changed[0].bias = torch.nn.Parameter(torch.tensor([50.0, -50.0]))  # a life is lost at every step
     steady = replace(happened, change=np.zeros_like(happened.change), vitals=np.full_like(happened.vitals, 3.0))
     targets, judged = [], []
@@ -140,7 +140,7 @@ def test_clips_go_on_with_vitals_of_their_own_and_learn_to_correct_them(learned,
     monkeypatch.setattr("terrella.learn.objectives.outcome.negative_log_likelihood", noted)
     objective = OutcomeObjective(outcome, seen.rgb, steady, batch=2)
     now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
-    list(objective.losses(objective.sample(now), now))
+    list(objective.losses(objective.sample(now, 2), now))
     assert [change.tolist() for change in targets] == [[followed * step] * 2 for step in range(len(targets))]
     assert judged == [[3 - followed * (step + 1)] * 2 for step in range(len(targets))], "ends are judged by them, too"
 

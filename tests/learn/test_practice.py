@@ -17,7 +17,7 @@ from terrella.core.policy import Idle
 from terrella.core.rollouts import rollout
 from terrella.core.state import State
 from terrella.core.world import make_rng
-from terrella.learn.imagination import ContinuedEpisodes
+from terrella.learn.imagination import ContinuedEpisodes, RecordedStarts
 from terrella.learn.objectives.actor_critic import Critic, Range, ReturnConfig, lambda_returns, step_weights
 from terrella.learn.objectives.outcome import two_hot
 from terrella.learn.recipes.policy import Practice, train_policy
@@ -155,6 +155,28 @@ def test_episodes_go_on_from_batch_to_batch_and_begin_anew_when_they_are_long() 
     again = starts.begin(now(1))
     kept = [bool(torch.equal(again["at"][n], moved["at"][n])) for n in range(4)]
     assert kept == [True, True, False, True]
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_practice_goes_on_with_half_of_the_episodes_where_memory_is_out(recorded, tmp_path, monkeypatch) -> None:
+    settings = replace(QUICK, steps=3, batch=16)
+    if recorded:
+        world = Point()
+        begun = RecordedStarts(world, world.start(32, make_rng(0)), 16)
+        monkeypatch.setattr("terrella.learn.recipes.policy._starts", lambda *_: begun)
+
+    class Small(Point):
+        def imagine(self, state, action, rng):
+            if len(action) > 5:
+                raise RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`")
+            return super().imagine(state, action, rng)
+
+    monkeypatch.setattr(ContinuedEpisodes, "sample", lambda self, sees: self.world.render(self.held.state(), sees))
+    with pytest.warns(UserWarning, match="halved to [84], and training goes on"):
+        facts = train_policy(Small(), "point", tmp_path, settings, quiet)
+    assert facts["practised_steps"] == 3 * 4 * 5
+    again = train_policy(Small(), "point", tmp_path, replace(settings, minutes=1.0), quiet)
+    assert again["practised_steps"] == facts["practised_steps"], "the smaller batch is kept"
 
 
 def test_nothing_but_a_reward_can_be_practised_for(tmp_path) -> None:

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
+from functorch.compile import make_boxed_func
 from tests.learn.small import FLAT
 from tests.learn.stopping import quiet
+from torch._dynamo.backends.common import aot_autograd
 
 from terrella.core.errors import TrainingError
-from terrella.learn.devices import Compiled
+from terrella.learn.devices import Compiled, device_named
 from terrella.learn.presets import GIB, PRESETS, STEPS, TrainingPlan
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recipes.video_config import TrainConfig
@@ -81,6 +83,39 @@ def test_a_world_is_trained_by_its_preset_which_is_said(corridor, tmp_path, monk
         train_video(corridor, tmp_path, replace(config, preset="large"), quiet)
     monkeypatch.setitem(STEPS, "cpu", 3)  # as on a device with other defaults: the run keeps its steps
     assert train_video(corridor, tmp_path, config, quiet)["step"] == facts["step"]
+
+
+def test_a_driver_that_is_too_old_is_said(monkeypatch):
+    def old(*given, device):
+        raise RuntimeError("The NVIDIA driver on your system is too old (found version 11040).\nUpdate it")
+
+    monkeypatch.setattr(torch, "zeros", old)
+    with pytest.raises(TrainingError, match=r"no such device here \(The NVIDIA driver .+ 11040\).\); say cpu, cuda or"):
+        device_named("cuda")
+
+
+def test_gradients_that_do_not_compile_are_computed_as_they_are(monkeypatch):
+    """A compiler has them wait for the first backward pass, where nobody would catch it."""
+
+    def broken(graph, inputs):
+        raise RuntimeError("no registers left")
+
+    backend = aot_autograd(fw_compiler=lambda graph, inputs: make_boxed_func(graph.forward), bw_compiler=broken)
+    whole = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda function, **options: whole(function, backend=backend, **options))
+    weight = torch.ones(2, requires_grad=True)
+    with pytest.warns(UserWarning, match=r"torch.compile fails here \(.*\): training goes on uncompiled"):
+        Compiled(lambda x: (weight * x).square())(torch.tensor([1.0, 2.0])).sum().backward()
+    assert weight.grad is not None and weight.grad.tolist() == [2.0, 8.0]
+
+
+def test_a_compiled_network_out_of_memory_is_no_fault_of_the_compiler(monkeypatch):
+    def lacking(*given):
+        raise RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`")
+
+    monkeypatch.setattr(torch, "compile", lambda function, **options: lacking)
+    with pytest.raises(RuntimeError, match="ALLOC_FAILED"):
+        Compiled(lambda x: x)(1)
 
 
 def test_without_a_compiler_it_computes_as_it_is_and_says_so(monkeypatch):

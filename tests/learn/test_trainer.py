@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import signal
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -200,7 +201,8 @@ def test_a_run_goes_on_without_a_setting_that_is_gone(tmp_path):
     assert trainer_in(out, steps=2).finished
 
 
-def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path):
+def test_a_loss_that_is_not_a_number_stops_and_leaves_the_last_good_save(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "half_is_native", lambda device: False)
     broken = Toy(float("nan"))
     with pytest.raises(TrainingError, match="the loss is not a number at step 0"):
         trainer_in(tmp_path, objective=broken).train()
@@ -231,22 +233,67 @@ def test_what_is_not_a_number_in_half_precision_goes_on_in_float32_from_the_last
     assert trainer_in(tmp_path, STEPS).facts["float32"], "it stays so"
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_device_that_is_asked_now_and_then_never_saves_what_is_not_a_number(stopped, tmp_path, monkeypatch):
+    class Overflows(Toy):
+        def losses(self, batch, now):
+            with now.half():  # statistics of the batch are broken, too, which no gradient repairs
+                yield from super().losses(batch if now.precise or now.step != 3 else batch * float("nan"), now)
+
+    for place in (train_step, module):
+        monkeypatch.setattr(place, "half_is_native", lambda device: True)
+    monkeypatch.setattr(train_step, "half_precision", lambda device: nullcontext())
+    monkeypatch.setattr(Trainer, "_waits", False)
+    every_s = 1e9 if stopped else 0.0
+    if stopped:
+        stop_in_step(monkeypatch, 4)
+    ends = pytest.raises(KeyboardInterrupt) if stopped else nullcontext()
+    with pytest.warns(UserWarning, match="training goes on in float32 from step"), ends:
+        trainer_in(tmp_path, objective=Overflows(), save_every_s=every_s).train()
+    saved, facts = load_file(tmp_path / "resume-toy.safetensors"), saved_facts(tmp_path, "toy")
+    assert all(part.isfinite().all() for part in saved.values()) and facts["float32"]
+    assert facts["step"] == (0 if stopped else STEPS), "from the last save, which was before the first step"
+
+
+def test_a_weight_that_is_not_a_number_is_not_saved(tmp_path):
+    trainer = trainer_in(tmp_path, 3)
+    trainer.train()
+    good = (tmp_path / "resume-toy.safetensors").read_bytes()
+    torch.nn.init.constant_(next(trainer.objective.modules["head"].parameters()), float("nan"))
+    with pytest.raises(TrainingError, match="a weight is not a number at step 3; the last save is good: lower"):
+        trainer.save()
+    assert (tmp_path / "resume-toy.safetensors").read_bytes() == good
+
+
 class Fed(Walk):
     """Batches that fit on a device of a few."""
 
-    def __init__(self, size, fits):
+    def __init__(self, size: int, fits: int, error: Exception = torch.OutOfMemoryError("CUDA out of memory")):  # noqa: B008
         super().__init__()
-        self.size, self.fits = size, fits
+        self.size, self.fits, self.error = size, fits, error
 
     def batch(self, now):
         if self.size > self.fits:
-            raise torch.OutOfMemoryError("CUDA out of memory")
+            raise self.error
         return super().batch(now)
 
 
-def test_a_device_out_of_memory_halves_the_batch_says_so_and_goes_on(tmp_path):
+LACKS = [
+    torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
+    RuntimeError("CUDA error: out of memory"),
+    RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
+    RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED when calling `cublasCreate(handle)`"),
+    RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),
+    RuntimeError("cuDNN error: CUDNN_STATUS_INTERNAL_ERROR_DEVICE_ALLOCATION_FAILED"),
+    RuntimeError("[enforce fail at alloc_cpu.cpp:117] DefaultCPUAllocator: can't allocate memory"),
+    MemoryError(),
+]
+
+
+@pytest.mark.parametrize("error", LACKS, ids=lambda error: str(error)[:40])
+def test_a_device_out_of_memory_halves_the_batch_says_so_and_goes_on(error, tmp_path):
     def trainer(size: int, fits: int = 2) -> Trainer:
-        feed = SizedFeed(lambda size: Fed(size, fits), size)
+        feed = SizedFeed(lambda size: Fed(size, fits, error), size)
         return Trainer(Run.of(tmp_path, Settings(), quiet), "toy", feed, Toy(), STEPS)
 
     with pytest.warns(
@@ -258,11 +305,23 @@ def test_a_device_out_of_memory_halves_the_batch_says_so_and_goes_on(tmp_path):
     assert resumed.finished and resumed.facts["batch"] == 2, "the smaller batch is kept"
     with (
         pytest.warns(UserWarning),
-        pytest.raises(TrainingError, match="too little memory for a batch of 1; train smaller"),
+        pytest.raises(TrainingError, match=r"too little memory for a batch of 1 \(.+\); train smaller"),
     ):
         Trainer(
             Run.of(tmp_path / "small", Settings(), quiet), "toy", SizedFeed(lambda size: Fed(size, 0), 2), Toy(), STEPS
         ).train()
+
+
+def test_a_trial_of_the_pace_halves_the_batch_too(tmp_path):
+    feed = SizedFeed(lambda size: Fed(size, 2), 8)
+    with pytest.warns(UserWarning, match="halved to [42]"):
+        assert Trainer(Run.of(tmp_path, Settings(), quiet), "toy", feed, Toy(), STEPS).time_steps(0.01) > 0
+
+
+def test_another_error_of_the_device_is_no_lack_of_memory(tmp_path):
+    feed = SizedFeed(lambda size: Fed(size, 2, RuntimeError("CUDA error: device-side assert triggered")), 8)
+    with pytest.raises(RuntimeError, match="device-side assert"):
+        Trainer(Run.of(tmp_path, Settings(), quiet), "toy", feed, Toy(), STEPS).train()
 
 
 def test_a_feed_that_cannot_shrink_says_what_to_do_where_memory_is_out(tmp_path):

@@ -18,6 +18,7 @@ from terrella.core.errors import PlanningError
 from terrella.core.world import make_rng
 from terrella.learn.objectives.group_relative import group_advantages, log_prob
 from terrella.learn.recipes.verified import RewardRule, VerifiedPractice, check_rewards, practise_verified
+from terrella.learn.sized_feed import ResizableFeed
 from terrella.learn.train_step import TrainStep
 from terrella.learn.verified_rollouts import VerifiedRollouts, WorldStarts
 
@@ -52,6 +53,13 @@ def test_the_reward_is_the_rule_and_decisions_after_success_do_not_count():
     assert ((ends == 8) | (batch.reward.flatten() == 1)).all() and (ends < 8).any()
     starts = homing.seen[0].view(4, 8, 2)
     assert torch.equal(starts, starts[:, :1].expand_as(starts)), "a group begins in one state"
+
+
+def test_where_memory_is_out_groups_are_fewer_and_as_large():
+    groups = feed(Point(), Homing(Point()), steps=2)
+    assert isinstance(groups, ResizableFeed) and groups.size == 4
+    groups.resize(2)
+    assert groups.batch(now()).reward.shape == (2, 8)
 
 
 class Homing:
@@ -100,6 +108,7 @@ def test_the_probability_of_a_choice_is_that_of_drawing_it(world, changes):
     policy = imitator(world, **changes)
     seen = world.render(world.start(1, make_rng(0)).fork(2000), policy.sees)
     _, _, choices = policy.explore(seen, policy.begin(2000, make_rng(1)), make_rng(2))
+    assert choices is not None
     logs = log_prob(policy.network, choices, 0.3).detach()
     if "chunk" in changes and changes["execute"] == 1:
         taken = choices.drawn[:, 0].argmax(1)
@@ -127,6 +136,7 @@ def test_practice_raises_the_share_of_successes(kind, tmp_path):
     def share(folder):
         policy = load(tmp_path / folder, world.spec)
         if kind == "imitation":
+            assert isinstance(policy.network, ImitationNetwork)
             policy = ImitationActor(policy.network, world.spec, std=0.1)
         return float(
             VerifiedRollouts(world, policy, WorldStarts(world), criterion, 6, (64, 4)).batch(now(9)).reward.mean()

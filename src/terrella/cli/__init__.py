@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
-from ..core.errors import TerrellaError
+from ..core.errors import TerrellaError, is_out_of_memory
 from ..core.files import remedy_of
 from ..core.similar import did_you_mean
 
@@ -85,7 +85,6 @@ RENAMED = {
 }
 
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
-_OUT_OF_MEMORY = "CUDA out of memory", "CUDA error: out of memory", "can't allocate memory"  # as PyTorch says it
 _RENDERERS = (
     "mujoco.egl", "mujoco.glfw", "mujoco.osmesa", "mujoco.cgl", "mujoco.gl_context", "glfw", "OpenGL",
     "gymnasium.envs.mujoco.mujoco_rendering",
@@ -234,8 +233,10 @@ def _sentence(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in _OF_THE_MACHINE:
         where = f" ({error.filename})" if error.filename else ""
         return f"{error.strerror}{where}; {remedy_of(error)}, or choose another folder."
-    if isinstance(error, MemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY):
-        where = "the GPU" if "CUDA" in str(error) else "this machine"
+    if is_out_of_memory(error):
+        where = (
+            "the GPU" if any(word in str(error) for word in ("CUDA", "CUBLAS", "CUDNN", "CUSOLVER")) else "this machine"
+        )
         smaller = "give a smaller --batch or --size, where the command has one"
         return f"{where} has too little memory for that; {smaller}{', or --device cpu' * (where == 'the GPU')}."
     if isinstance(error, ModuleNotFoundError) and error.name in ("mujoco", "glfw", "OpenGL"):

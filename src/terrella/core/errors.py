@@ -1,5 +1,21 @@
 """The errors that Terrella raises on purpose. Each message is one sentence: what is wrong, and what to do."""
 
+_OUT_OF_MEMORY = (  # as PyTorch and the libraries of CUDA say it; a library that finds no room for itself is not initialised
+    "CUDA out of memory", "CUDA error: out of memory", "can't allocate memory", "not enough memory", "ALLOC_FAILED",
+    "ALLOCATION_FAILED", "CUBLAS_STATUS_NOT_INITIALIZED", "CUDNN_STATUS_NOT_INITIALIZED",
+)  # fmt: skip
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a device or the machine had too little memory, by the error of PyTorch, of a library of CUDA, or of Python."""
+    named = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    return named or isinstance(error, RuntimeError) and any(words in str(error) for words in _OUT_OF_MEMORY)
+
+
+def reason_of(error: BaseException) -> str:
+    """The first line of an error, for a sentence."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
 
 class TerrellaError(Exception):
     """Base of all deliberate errors; the command line prints it as one line and exits with 2."""

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from torch._functorch import config as functorch_config
 
-from ..core.errors import TrainingError
+from ..core.errors import TrainingError, is_out_of_memory, reason_of
 
 BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 
@@ -21,8 +22,10 @@ def device_named(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device)
         return device
-    except (RuntimeError, AssertionError, NotImplementedError, ModuleNotFoundError):
-        raise TrainingError(f"--device {name}: PyTorch has no such device here; say cpu, cuda or auto.") from None
+    except (RuntimeError, AssertionError, NotImplementedError, ModuleNotFoundError) as error:
+        raise TrainingError(
+            f"--device {name}: PyTorch has no such device here ({reason_of(error)}); say cpu, cuda or auto."
+        ) from None
 
 
 def describe_device(name: str) -> str:
@@ -67,16 +70,17 @@ class Compiled:
 
     def __init__(self, function: Callable[..., Any]):
         self._function, self._fast = function, torch.compile(function, dynamic=False)
+        if hasattr(functorch_config, "force_non_lazy_backward_lowering"):  # gradients fail to compile at that call, too
+            functorch_config.force_non_lazy_backward_lowering = True
 
     def __call__(self, *given: Any) -> Any:
         if self._fast is None:
             return self._function(*given)
         try:
             return self._fast(*given)
-        except torch.OutOfMemoryError:
-            raise
         except Exception as error:  # compilers fail in many ways
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            warnings.warn(f"torch.compile fails here ({reason}): training goes on uncompiled.", stacklevel=2)
+            if is_out_of_memory(error):
+                raise
+            warnings.warn(f"torch.compile fails here ({reason_of(error)}): training goes on uncompiled.", stacklevel=2)
         self._fast = None
         return self._function(*given)

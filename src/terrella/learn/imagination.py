@@ -44,10 +44,13 @@ class ImaginedRollouts:
 
 
 class RolloutStarts(Protocol):
-    """The states in which rollouts begin. `modules` are saved with the run."""
+    """The states in which rollouts begin, `batch` at a time, which `shrink` lowers. `modules` are saved with the run."""
 
     @property
     def modules(self) -> Mapping[str, nn.Module]: ...
+    @property
+    def batch(self) -> int: ...
+    def shrink(self, batch: int) -> None: ...
     def begin(self, now: TrainStep) -> State: ...
     def end(self, state: State, steps: int, now: TrainStep) -> None: ...
     def sample(self, channels: Sequence[str]) -> Mapping[str, torch.Tensor]: ...
@@ -59,6 +62,9 @@ class RecordedStarts:
     def __init__(self, world: World, states: State, batch: int):
         self.world, self.states, self.batch = world, states, batch
         self.modules: dict[str, nn.Module] = {}
+
+    def shrink(self, batch: int) -> None:
+        self.batch = batch
 
     def begin(self, now: TrainStep) -> State:
         picked = now.rng.integers(self.states.batch, size=self.batch)
@@ -84,9 +90,16 @@ class ContinuedEpisodes:
         self.anew = bool(state.arenas)
         self.modules = {} if self.anew else {"episodes": self.held}
 
+    @property
+    def batch(self) -> int:
+        return len(self.held.age)
+
+    def shrink(self, batch: int) -> None:
+        self.held.shrink(batch)
+
     def begin(self, now: TrainStep) -> State:
         if self.anew:
-            return self.world.start(len(self.held.age), now.seeding)
+            return self.world.start(self.batch, now.seeding)
         state, over = self.held.state(), self.held.age >= self.longest
         if state.device.type != "cpu":  # a whole batch begins anew, of which some are taken: nothing waits for how many
             fresh = self.world.start(len(over), now.seeding)
@@ -132,6 +145,11 @@ class _Held(nn.Module):
     def state(self) -> State:
         return State({name: getattr(self, f"tensor{number}") for number, name in enumerate(self.names)})
 
+    def shrink(self, batch: int) -> None:
+        """Keeps the first episodes alone."""
+        for name, tensor in list(self.named_buffers()):
+            setattr(self, name, tensor[:batch].clone())
+
     def hold(self, state: State) -> None:
         for number, name in enumerate(self.names):
             setattr(self, f"tensor{number}", state[name].detach().clone())
@@ -143,6 +161,8 @@ class Imagination:
     gradients: whether rewards and observations are differentiable by the actions. trust: the uncertainty up to which a rollout is
     used. growth: the curriculum of the world's randomisation ranges.
     """
+
+    least = 1
 
     def __init__(
         self,
@@ -157,6 +177,14 @@ class Imagination:
         check_practised(world.spec)
         self.world, self.network, self.starts, self.steps = world, network, starts, steps
         self.gradients, self.trust, self.growth = gradients, trust, growth
+
+    @property
+    def size(self) -> int:
+        """Episodes of a batch."""
+        return self.starts.batch
+
+    def resize(self, size: int) -> None:
+        self.starts.shrink(min(size, self.size))
 
     def batch(self, now: TrainStep) -> ImaginedRollouts:
         if self.growth is not None:

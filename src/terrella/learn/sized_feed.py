@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from .train_step import TrainStep
 
@@ -14,6 +14,17 @@ class Feed(Protocol):
     def batch(self, now: TrainStep, /) -> Any: ...
     def state(self) -> dict: ...
     def resume(self, state: Mapping) -> None: ...
+
+
+@runtime_checkable
+class ResizableFeed(Feed, Protocol):
+    """A feed whose batches can become smaller: `size` entries, `least` or more."""
+
+    least: int
+
+    @property
+    def size(self) -> int: ...
+    def resize(self, size: int) -> None: ...
 
 
 class SizedFeed:

@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..core.errors import TrainingError
+from ..core.errors import TrainingError, is_out_of_memory, reason_of
 from ..core.world import make_rng
 from .budget import Budget
-from .devices import yield_cores
+from .devices import half_is_native, yield_cores
 from .learners import Learner
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
-from .sized_feed import Feed, SizedFeed
+from .sized_feed import Feed, ResizableFeed
 from .train_step import TrainStep
 
 Report = Callable[[float, float, str], None]
@@ -167,6 +167,11 @@ class Trainer:
         return self.share >= 1
 
     @property
+    def _waits(self) -> bool:
+        """Whether each step is looked at, which costs nothing on a CPU."""
+        return self.device.type == "cpu"
+
+    @property
     def share(self) -> float:
         """The part of the training that is done, by steps or by time, whichever is more."""
         by_time = self.facts["seconds"] / self.limit_s if self.limit_s > 0 else 1.0
@@ -185,6 +190,8 @@ class Trainer:
 
     def _train(self, draw: Callable[[], object] | None, stop: threading.Event, paced: Paced | None) -> None:
         facts, run = self.facts, self.run
+        if half_is_native(self.device) and not self._file.exists():
+            self.save()  # to go back to from what is not a number
         began = saved = drawn = looked = time.monotonic()
         before, first = facts["seconds"], self.steps_done
         while not self.finished and not stop.is_set():
@@ -194,7 +201,7 @@ class Trainer:
             facts["seconds"] = before + now - began
             if len(facts["recent"]) == LOG_EVERY or self.finished:
                 self._log((self.steps_done - first) / max(now - began, 1e-9))
-            if now - saved > run.save_every_s:
+            if now - saved > run.save_every_s and self._settled():
                 self.save()
                 saved = now
             if now - looked > LOOK_S:
@@ -208,6 +215,7 @@ class Trainer:
                 at_pace = (self.limit_s - before) * (self.steps_done - first) / spent_s
                 paced(min(self.batches * self.strides, first + int(at_pace)))
                 paced = None
+        self._settled()
         self.save()
         if stop.is_set():
             done = f"{self.steps_done} steps of '{self.stage}' are saved in {run.out}"
@@ -220,28 +228,29 @@ class Trainer:
         try:
             facts["recent"].append(self._step(facts["step"]))
             facts["step"] += 1
-            if len(facts["recent"]) == LOG_EVERY or self.finished:
-                self._check_finite()
-            return True
-        except torch.OutOfMemoryError as error:
-            if not isinstance(self.feed, SizedFeed):
-                raise TrainingError(
-                    f"{self.device} has too little memory for this batch; give a smaller --batch, or compute on the CPU. What was "
-                    f"saved before is in {self.run.out}."
-                ) from error
+            return (len(facts["recent"]) < LOG_EVERY and not self.finished) or self._settled()
         except _NotFinite as error:
             self._go_on_in_float32(error)
             return False
-        self._halve_batch()  # here the tensors of the step are free
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            reason = reason_of(error)
+        self._halve_batch(reason)  # here the tensors of the step are free
+        if self._settled():
+            self.save()  # with the smaller batch
         return False
 
-    def _halve_batch(self) -> None:
-        feed = self.feed
-        assert isinstance(feed, SizedFeed)
+    def _halve_batch(self, reason: str) -> None:
+        feed, lacks = self.feed, f"{self.device} has too little memory for"
+        if not isinstance(feed, ResizableFeed):
+            raise TrainingError(
+                f"{lacks} this batch; give a smaller --batch, or compute on the CPU. What was saved before is in {self.run.out}."
+            )
         if feed.size < 2 * feed.least:
             raise TrainingError(
-                f"{self.device} has too little memory for a batch of {feed.size}; train smaller pictures or networks, or on the "
-                "CPU (--device cpu)."
+                f"{lacks} a batch of {feed.size} ({reason}); train smaller pictures or networks, or on the CPU (--device cpu). "
+                f"What was saved before is in {self.run.out}."
             )
         feed.resize(feed.size // 2)
         torch.cuda.empty_cache()
@@ -249,7 +258,7 @@ class Trainer:
         warnings.warn(f"{self.device} ran out of memory: {half}.", stacklevel=2)
 
     def _go_on_in_float32(self, error: TrainingError) -> None:
-        """From the last save, without one from these weights: no step that was not a number changed them."""
+        """From the last save, as in half precision there is one; without it from these weights, which no such step changed."""
         if self.facts.get("float32") or not self._halved:
             raise error
         self._finite.clear()
@@ -263,9 +272,10 @@ class Trainer:
 
     def _load(self) -> None:
         """Restores the last save, with batches as large as then."""
+        if isinstance(self.feed, ResizableFeed):
+            saved = load_run(self._file, {}, {}) or {}
+            self.feed.resize(saved.get("batch", self.feed.size))
         self.facts |= load_run(self._file, self.objective.modules, self._optimisers) or {}
-        if isinstance(self.feed, SizedFeed):
-            self.feed.resize(self.facts.get("batch", self.feed.size))
         self.feed.resume(self.facts["feed"])
 
     def time_steps(self, most_s: float) -> float:
@@ -274,11 +284,19 @@ class Trainer:
         for step in itertools.count():
             rng = np.random.default_rng([self.run.seed, step])
             now = TrainStep(step, 0.0, self.device, rng, make_rng(step))
-            for loss in self.objective.losses(self.feed.batch(now), now):
-                self._descend(loss, step * self.strides)
-                ends.append(time.monotonic())
-                if len(ends) > 3 and (ends[-1] - began > most_s or len(ends) > 60):
-                    return (ends[-1] - ends[0]) / (len(ends) - 1)
+            try:
+                for loss in self.objective.losses(self.feed.batch(now), now):
+                    self._descend(loss, step * self.strides)
+                    ends.append(time.monotonic())
+                    if len(ends) > 3 and (ends[-1] - began > most_s or len(ends) > 60):
+                        return (ends[-1] - ends[0]) / (len(ends) - 1)
+                continue
+            except (RuntimeError, MemoryError) as error:
+                if not is_out_of_memory(error):
+                    raise
+                reason = reason_of(error)
+            self._halve_batch(reason)
+            ends.clear()
         raise AssertionError  # a feed never ends
 
     def _step(self, step: int) -> dict[str, list[torch.Tensor]]:
@@ -315,6 +333,16 @@ class Trainer:
                     if isinstance(values, list)
                 }
 
+    def _settled(self) -> bool:
+        """Whether all was finite since the last time, as it must be before a save. Else training goes on from the last save, in
+        float32; TrainingError where it already computes so."""
+        try:
+            self._check_finite()
+            return True
+        except _NotFinite as error:
+            self._go_on_in_float32(error)
+            return False
+
     def _check_finite(self) -> None:
         """Waits for the device. TrainingError if a loss or a gradient was not a number since the last time."""
         finite, self._finite = self._finite, []
@@ -323,7 +351,7 @@ class Trainer:
 
     def _descend(self, loss: Loss, step: int) -> None:
         """One gradient step."""
-        learner, waits = self.objective.learners[loss.learner], self.device.type == "cpu"
+        learner, waits = self.objective.learners[loss.learner], self._waits
         finite = torch.isfinite(loss.value.detach())
         if waits and not finite:
             raise _NotFinite(_not_a_number("the loss", step))
@@ -343,10 +371,13 @@ class Trainer:
             learner.average.update(learner.modules[0])
 
     def save(self) -> None:
-        """Saves the run as it is after its last whole step."""
+        """Saves the run as it is after its last whole step. TrainingError, and no save, if a weight is not a number."""
         self._read_losses()
+        for module in self.objective.modules.values():
+            if any(bool(weight.isnan().any()) for weight in module.parameters()):
+                raise _NotFinite(_not_a_number("a weight", self.steps_done))
         self.run.out.mkdir(parents=True, exist_ok=True)
-        if isinstance(self.feed, SizedFeed):
+        if isinstance(self.feed, ResizableFeed):
             self.facts["batch"] = self.feed.size
         self.facts |= {"feed": self.feed.state(), "spent": self.run.budget.spent_s}
         save_run(self._file, self.objective.modules, self._optimisers, self.facts)

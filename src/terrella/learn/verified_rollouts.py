@@ -87,6 +87,8 @@ class VerifiedRollouts:
     blind: the policy sees the first observation of one start at every step instead of the world's.
     """
 
+    least = 1
+
     def __init__(
         self,
         world: World,
@@ -98,22 +100,30 @@ class VerifiedRollouts:
         blind: bool = False,
     ):
         self.world, self.policy, self.starts, self.criterion, self.steps = world, policy, starts, criterion, steps
-        self.groups, self.size = shape
+        self.groups, self.of_group = shape
         spec, most = world.spec, world.spec.max_batch
-        if not spec.forkable or (most is not None and most < self.groups * self.size):
+        if not spec.forkable or (most is not None and most < self.groups * self.of_group):
             raise TrainingError(
-                f"{spec.name} cannot imagine {self.groups} x {self.size} episodes from the same starts; give fewer (--groups, "
+                f"{spec.name} cannot imagine {self.groups} x {self.of_group} episodes from the same starts; give fewer (--groups, "
                 "--group-size), or learn a world of it first."
             )
         self.mask = dict(world.render(world.start(1, make_rng(0)), policy.sees)) if blind else {}
         self.mask = {name: value for name, value in self.mask.items() if kind_of(name) not in SHOWN_BLIND}
 
+    @property
+    def size(self) -> int:
+        """Groups of a batch."""
+        return self.groups
+
+    def resize(self, size: int) -> None:
+        self.groups = size
+
     @torch.no_grad()
     def batch(self, now: TrainStep) -> GroupedRollouts:
-        world, criterion, count = self.world, self.criterion, self.groups * self.size
+        world, criterion, count = self.world, self.criterion, self.groups * self.of_group
         state, paths = self.starts.begin(self.groups, now)
-        state = state.fork(self.size)
-        paths = {name: path.repeat_interleave(self.size, 0) for name, path in paths.items()}
+        state = state.fork(self.of_group)
+        paths = {name: path.repeat_interleave(self.of_group, 0) for name, path in paths.items()}
         outcome = [name for name in ("done", "reward") if name in world.spec.channels]
         channels = tuple(dict.fromkeys((*self.policy.sees, *criterion.channels, *outcome, *paths)))
         memory, choices, weights = self.policy.begin(count, now.seeding), list[Choices](), list[torch.Tensor]()
@@ -138,7 +148,7 @@ class VerifiedRollouts:
                 away.append(torch.where(going > 0, self._apart(paths, seen, step + 1), torch.nan))
             going = going * (1 - over)
         reward = -torch.stack(away).nanmean(0) if paths else success if criterion.defined else total
-        return GroupedRollouts(Choices.join(choices), torch.stack(weights), reward.view(self.groups, self.size))
+        return GroupedRollouts(Choices.join(choices), torch.stack(weights), reward.view(self.groups, self.of_group))
 
     def state(self) -> dict:
         return {}

@@ -17,6 +17,7 @@ import torch
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from ..core.backend import tensor_programs
+from ..core.errors import reason_of
 from ..core.state import State
 
 WARM_UP = 3  # runs before a capture, in which libraries choose their algorithms
@@ -116,9 +117,7 @@ def compiled(graph: torch.fx.GraphModule, inputs: list[torch.Tensor], compiler: 
     try:
         run(inputs)
     except Exception as error:  # compilers fail in many ways
-        lines = str(error).strip().splitlines()
-        reason = lines[0] if lines else type(error).__name__
-        warnings.warn(f"torch.compile fails here ({reason}); steps run uncompiled.", stacklevel=2)
+        warnings.warn(f"torch.compile fails here ({reason_of(error)}); steps run uncompiled.", stacklevel=2)
         return graph, "traced"
     return run, f"torch.compile ({compiler})"
 
@@ -128,8 +127,7 @@ def with_graph(run: Run, inputs: list[torch.Tensor], way: str) -> tuple[Run, str
     try:
         return captured(run, inputs), f"{way}, captured as a CUDA graph"
     except RuntimeError as error:  # of the driver, or for lack of memory
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        warnings.warn(f"CUDA graphs fail here ({reason}); steps run kernel by kernel.", stacklevel=2)
+        warnings.warn(f"CUDA graphs fail here ({reason_of(error)}); steps run kernel by kernel.", stacklevel=2)
         return run, way
 
 

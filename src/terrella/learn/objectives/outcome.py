@@ -13,6 +13,7 @@ from ...data import ClipCache
 from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
 from ..feeds import RandomBatches
 from ..learners import Learner, warmup_cosine
+from ..sized_feed import SizedFeed
 from ..train_step import TrainStep
 from ..trainer import Loss, Run, Trainer
 
@@ -118,9 +119,9 @@ class OutcomeObjective:
         self.modules = {"outcome": outcome}
         self.learners = {"outcome": Learner(optimiser, (outcome,), warmup_cosine(learning_rate, 50, 0.03))}
 
-    def sample(self, now: TrainStep) -> tuple[np.ndarray, torch.Tensor]:
+    def sample(self, now: TrainStep, size: int) -> tuple[np.ndarray, torch.Tensor]:
         """The first rows of a batch of clips, and their importance weights."""
-        picks = now.rng.choice(len(self.starts), self.size, p=self.often)
+        picks = now.rng.choice(len(self.starts), size, p=self.often)
         return self.starts[picks], torch.from_numpy(self.even[picks] / self.often[picks]).float()
 
     def losses(self, batch: tuple[np.ndarray, torch.Tensor], now: TrainStep) -> Iterator[Loss]:
@@ -162,7 +163,8 @@ def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:
     """Trains the objective's FrameOutcome in place; returns facts of the training."""
     if not len(objective.starts):
         return {"outcome_steps": 0}
-    trainer = Trainer(run, "outcome", RandomBatches(objective.sample), objective, steps)
+    feed = SizedFeed(lambda size: RandomBatches(lambda now: objective.sample(now, size)), objective.size)
+    trainer = Trainer(run, "outcome", feed, objective, steps)
     trainer.train()
     objective.outcome.eval()
     return {"outcome_steps": trainer.facts["step"]}

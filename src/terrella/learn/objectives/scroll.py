@@ -13,6 +13,7 @@ from ...worlds.scroll import Scroll, least_off
 from ..feeds import RandomBatches
 from ..learners import adamw, warmup_cosine
 from ..recording import Recording
+from ..sized_feed import SizedFeed
 from ..train_step import TrainStep
 from ..trainer import Loss, Run, Trainer
 
@@ -40,7 +41,8 @@ def learn_scroll(run: Run, scroll: Scroll, recording: Recording, moves: torch.Te
     """Trains `scroll` in place, if pictures of the recording scroll at all."""
     objective = ScrollObjective(scroll, recording, moves, slots)
     if objective.scrolls.any():
-        Trainer(run, "scroll", RandomBatches(objective.sample), objective, STEPS).train()
+        feed = SizedFeed(lambda size: RandomBatches(lambda now: objective.sample(now, size)), BATCH)
+        Trainer(run, "scroll", feed, objective, STEPS).train()
 
 
 class ScrollObjective:
@@ -58,9 +60,9 @@ class ScrollObjective:
         self.modules = {"scroll": scroll}
         self.learners = {"scroll": adamw((scroll,), warmup_cosine(2e-3, 20), decay=0.05)}
 
-    def sample(self, now: TrainStep) -> ScrollClips:
+    def sample(self, now: TrainStep, size: int = BATCH) -> ScrollClips:
         weight = STILL_WEIGHT + (1 - STILL_WEIGHT) * self.scrolls
-        return self.clips_at(now.rng.choice(self.rows, BATCH, p=weight / weight.sum()))
+        return self.clips_at(now.rng.choice(self.rows, size, p=weight / weight.sum()))
 
     def clips_at(self, rows: np.ndarray) -> ScrollClips:
         """The clips whose first steps are `rows`."""

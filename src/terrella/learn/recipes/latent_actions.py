@@ -14,6 +14,7 @@ from ..objectives.latent_actions import LatentActionsObjective
 from ..objectives.latent_model import LatentModel
 from ..recording import Recording
 from ..run_folder import load_run, resume_file
+from ..sized_feed import SizedFeed
 from ..strips import write_lines
 from ..trainer import Report, Run, Trainer
 
@@ -56,11 +57,12 @@ def train_latent_actions(data: str | Path, out: str | Path, config: LatentAction
     torch.manual_seed(config.seed)
     model = LatentModel(config.codes, config.stride, config.size, device)
     objective = LatentActionsObjective(model, config.learning_rate)
-    clips = Clips(
-        recording.cache,
-        ClipsConfig(2, ("rgb",), config.batch, stride=config.stride, seed=config.seed, episodes=recording.seen),
-    )
-    trainer = Trainer(run, STAGE, ClipStream(clips, lambda rows, now: rows["rgb"]), objective, config.steps)
+
+    def clips(size: int) -> ClipStream:
+        settings = ClipsConfig(2, ("rgb",), size, stride=config.stride, seed=config.seed, episodes=recording.seen)
+        return ClipStream(Clips(recording.cache, settings), lambda rows, now: rows["rgb"])
+
+    trainer = Trainer(run, STAGE, SizedFeed(clips, config.batch), objective, config.steps)
 
     def draw() -> None:
         draw_strip(model, recording, config.seed, run.out / f"strip-{trainer.facts['step']:06d}.png")

@@ -210,7 +210,7 @@ def _card(trainer: Trainer, name: str, spec: Spec, config: PracticeSettings) -> 
     return {
         "what": f"A policy that practised in {spec.name}",
         "practised_in": name,
-        "practised_steps": steps * config.batch * config.horizon,
+        "practised_steps": steps * min(config.batch, trainer.facts.get("batch", config.batch)) * config.horizon,
         "minutes": round(trainer.facts["seconds"] / 60, 2),
     }
 

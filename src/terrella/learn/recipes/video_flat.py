@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ...core.errors import DatasetError, TrainingError
+from ...core.errors import DatasetError, TrainingError, is_out_of_memory
 from ...space.ground import joined
 from ...space.matching import scroll_index
 from ...space.mosaic import read_mosaic
@@ -124,13 +124,16 @@ class FlowRecipe:
         if device.type != "cuda" or (self.begin is not None and self.begin.kept is not None):
             return None, ""
         size = bytes_of(recording, self.stitched)
+        whole, lacking = f"the recording ({size / GIB:.2g} GiB)", "its memory: clips come from the CPU"
         if size > ROOM * free_bytes:
-            return (
-                None,
-                f"the recording ({size / GIB:.2g} GiB) takes more than half of its memory: clips come from the CPU",
-            )
-        grounds = None if self.stitched is None else DeviceGrounds(self.stitched, self.over, device)
-        held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
+            return None, f"{whole} takes more than half of {lacking}"
+        try:
+            grounds = None if self.stitched is None else DeviceGrounds(self.stitched, self.over, device)
+            held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            return None, f"{whole} does not fit into {lacking}"
         return held, f"the recording on it ({size / GIB:.2g} GiB)"
 
     def feed(self, batch: int) -> Feed:
