@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,18 +16,15 @@ from ..core.errors import TerrellaError
 from ..core.spec import kind_of, neutral_action, torch_dtype_of
 from ..core.state import State
 from ..core.world import Leaping, Observation, World, make_rng
+from .judge import Judge, Judged
 from .system import PhysicalSystem
 from .tolerance import Tolerance
-from .trajectory import Trajectory, channels_of, trajectory_of
 
-ORDER = (
-    "permanence", "free fall", "momentum", "support and friction", "limits", "energy", "continuity", "non-penetration",
-)  # fmt: skip
-ROUNDS = 3  # of projections: one may break a law that was kept before
 MAX_DUMPS = 8
 FROZEN = 0.5  # of the way that the world predicted: a correction below it stops things
 KEPT = ("reward", "done", "done_probability", "spread")  # of the prediction, where a corrected state is observed
 _GUARD = "guard."
+HELD = _GUARD + "held"
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,8 @@ class Guarded:
     observes its channels, whose step replaces a broken one. A world is corrected through its channels: it must observe those of the
     system, and no pictures. TerrellaError otherwise.
 
-    State: that of the world, and guard.NAME [B, 2, K], the last two instants of each channel of the system; guard.* counts."""
+    State: that of the world, and guard.held [B, 2, K], the last two instants of the system's channels, one after the other;
+    guard.* counts."""
 
     def __init__(
         self,
@@ -87,10 +85,11 @@ class Guarded:
         config: GuardConfig = GuardConfig(),
     ):
         self.world, self.system, self.simulator, self.config = world, system, simulator, config
-        self.tolerances = sorted(
-            (one for one in tolerances if not one.wrong_here), key=lambda one: ORDER.index(one.law.name)
-        )
         world.spec.check_channels(system.channels)
+        widths = {name: int(np.prod(world.spec.channels[name].shape or ())) for name in system.channels}
+        right = [one for one in tolerances if not one.wrong_here]
+        self._judge = Judge(system, right, world.spec.dt_s, widths)
+        self.tolerances = self._judge.tolerances
         pictures = [name for name in world.spec.observes if kind_of(name) == "rgb"]
         changes = config.project or simulator is not None
         if changes and (
@@ -141,49 +140,46 @@ class Guarded:
     def imagine(self, state: State, action: Tensor, rng: torch.Generator) -> State:
         bare, seeds = _bare(state), chance.seeds(state.batch, rng)
         proposal = self.world.imagine(bare, action, rng)
-        predicted = self._motion(state, self._seen(proposal))
-        fresh = state[_GUARD + "age"] == 0
-        ratios = self._ratios(predicted, fresh)
-        broken = ratios > 1
-        wrong = broken.any(1) & ~_done(bare)
+        seen, goes_on = self._seen(proposal), ~_done(bare)
+        drawn, simulates = self.config.draws > 1, self.simulator is not None
+        corrects = goes_on if self.config.project else torch.zeros_like(goes_on)
+        first = self._judged(state, seen, torch.zeros_like(goes_on) if drawn or simulates else corrects)
+        broken = first.before > 1
+        wrong = broken.any(1) & goes_on
         if self.config.dumps is not None and wrong.any():
             self._dump(bare.at(wrong), action[wrong])
-        if self.config.draws > 1 and wrong.any():
-            proposal, predicted, ratios = self._drawn_again(state, proposal, predicted, ratios, wrong, action, seeds)
-        motion, by_simulator = predicted, torch.zeros(state.batch, dtype=torch.bool)
-        if self.simulator is not None:
-            by_simulator = wrong if self.config.disagreement is None else self._disagrees(bare, action) & ~_done(bare)
-            motion = self._simulated(state, motion, action, by_simulator)
-        if motion is not predicted:
-            ratios = self._ratios(motion, fresh)
-        if self.config.project:
-            motion, ratios = self._projected(motion, ratios, fresh, ~_done(bare) & ~by_simulator)
-        left = ratios > 1
-        changed = changed_rollouts(predicted, motion)
-        flat = {
-            name: torch.where(changed[:, None], part, predicted.channels[name][-1])
-            for name, part in channels_of(motion).items()
-        }
+        if drawn and wrong.any():
+            proposal = self._drawn_again(state, proposal, first.before, wrong, action, seeds)
+            seen = self._seen(proposal)
+        last, by_simulator = first, torch.zeros_like(goes_on)
+        if simulates:
+            by_simulator = wrong if self.config.disagreement is None else self._disagrees(bare, action) & goes_on
+        if drawn or simulates:
+            first = self._judged(state, seen, torch.zeros_like(goes_on))
+            given = self._simulated(state, seen, action, by_simulator)
+            last = self._judged(state, given, corrects & ~by_simulator)
+        changed = last.changed | by_simulator
         if changed.any():
-            proposal = self._written(proposal, flat, changed, rng)
-        way = torch.stack([_way(predicted), _way(motion)], 1)
+            proposal = self._written(proposal, last.seen, changed, rng)
         counts = {
             "age": 1,
             "broken": broken,
-            "left": left,
-            "corrected": changed & ~by_simulator,
+            "left": last.left > 1,
+            "corrected": last.changed,
             "simulated": by_simulator,
-            "way": way,
+            "way": torch.stack([first.way[:, 0], last.way[:, 1]], 1),
         }
-        history = {name: torch.stack([part[-2], flat[name]], 1) for name, part in motion.channels.items()}
-        counted = {name: state[_GUARD + name] + value for name, value in counts.items()}
-        return proposal.replace(**{_GUARD + name: part for name, part in {**history, **counted}.items()})
+        counted = {_GUARD + name: state[_GUARD + name] + value for name, value in counts.items()}
+        return proposal.replace(**counted, **{HELD: torch.stack([state[HELD][:, 1], last.seen], 1)})
 
     def render(self, state: State, channels: Sequence[str]) -> dict[str, Tensor]:
         self.spec.check_channels(channels)
         others = [name for name in channels if name not in self.system.channels]
-        shown = dict(self.world.render(_bare(state), others)) if others else {}
-        return {name: shown[name] if name in shown else self._corrected(state, name) for name in channels}
+        shown, held = (
+            dict(self.world.render(_bare(state), others)) if others else {},
+            self._judge.parts(state[HELD][:, 1]),
+        )
+        return {name: shown[name] if name in shown else self._shaped(name, held[name]) for name in channels}
 
     def report(self, state: State) -> GuardReport:
         """What was done since the episodes of this state began."""
@@ -201,11 +197,10 @@ class Guarded:
 
     def _begun(self, inner: State, prior: State | None, observation: Observation = MappingProxyType({})) -> State:
         """What was observed is held as it was observed: a world may clip what lies beyond its training."""
-        seen, batch = self._seen(inner), inner.batch
-        given = {name: torch.as_tensor(observation[name]) for name in seen if name in observation}
-        seen |= {name: part.cpu().double().reshape(batch, -1) for name, part in given.items()}
-        before = {name: part if prior is None else prior[_GUARD + name][:, -1] for name, part in seen.items()}
-        held = {_GUARD + name: torch.stack([before[name], part], 1) for name, part in seen.items()}
+        batch = inner.batch
+        given = {name: torch.as_tensor(observation[name]) for name in self.system.channels if name in observation}
+        seen = self._seen(inner, given)
+        held = {HELD: torch.stack([seen if prior is None else prior[HELD][:, 1], seen], 1)}
         laws = len(self.tolerances)
         zeros = {"age": (), "broken": (laws,), "left": (laws,), "corrected": (), "simulated": (), "way": (2,)}
         for name, shape in zeros.items():
@@ -213,49 +208,23 @@ class Guarded:
             held[key] = torch.zeros(batch, *shape, dtype=torch.float64) if prior is None else prior[key]
         return inner.replace(**held)
 
-    def _seen(self, inner: State) -> dict[str, Tensor]:
-        """The channels of the system, float64 [B, K]."""
-        shown = self.world.render(inner, self.system.channels)
-        return {name: part.detach().cpu().double().reshape(len(part), -1) for name, part in shown.items()}
+    def _seen(self, inner: State, given: Mapping[str, Tensor] = MappingProxyType({})) -> Tensor:
+        """The channels of the system, or those given, float64 [B, K]."""
+        rest = [name for name in self.system.channels if name not in given]
+        shown = {**given, **(self.world.render(inner, rest) if rest else {})}
+        flat = [shown[name].detach().cpu().reshape(inner.batch, -1) for name in self.system.channels]
+        return torch.cat(flat, 1).double()
 
-    def _motion(self, state: State, seen: Mapping[str, Tensor]) -> Trajectory:
-        """The last three instants."""
-        rows = {name: torch.cat([state[_GUARD + name].transpose(0, 1), part[None]]) for name, part in seen.items()}
-        return trajectory_of(self.system, rows, self.spec.dt_s)
+    def _judged(self, state: State, seen: Tensor, allowed: Tensor) -> Judged:
+        return self._judge(state[HELD], seen, state[_GUARD + "age"] == 0, allowed)
 
-    def _ratios(self, motion: Trajectory, fresh: Tensor) -> Tensor:
-        """The violation of the last step by each law [B, L], in tolerances. fresh: episodes that have one step only."""
-        if not self.tolerances:
-            return motion.position.new_zeros(motion.batch, 0)
-        return torch.stack([_ratio(one, motion, fresh) for one in self.tolerances], 1)
-
-    def _projected(
-        self, motion: Trajectory, ratios: Tensor, fresh: Tensor, allowed: Tensor
-    ) -> tuple[Trajectory, Tensor]:
-        """(motion, ratios) after the projections of the laws that each rollout breaks, in turn. A round works on the rollouts that
-        still break a law, and judges them at its end."""
-        for _ in range(ROUNDS):
-            rows = ((ratios > 1).any(1) & allowed).nonzero()[:, 0]
-            if not len(rows):
-                break
-            part, wrong = motion.at(rows), ratios[rows] > 1
-            for one, broken in zip(self.tolerances, wrong.T):
-                if broken.any():
-                    part = _mixed(part, one.law.correct(part), broken)
-            motion = motion.put(rows, part)
-            ratios = ratios.index_copy(0, rows, self._ratios(part, fresh[rows]))
-        return motion, ratios
-
-    def _simulated(self, state: State, motion: Trajectory, action: Tensor, rows: Tensor) -> Trajectory:
-        assert self.simulator is not None
-        if not rows.any():
-            return motion
+    def _simulated(self, state: State, seen: Tensor, action: Tensor, rows: Tensor) -> Tensor:
+        """`seen` with a simulator's step in these rows."""
+        if self.simulator is None or not rows.any():
+            return seen
         sim, rng = self.simulator, make_rng(0)
-        before = {
-            name: self._shaped(name, state[_GUARD + name][rows, -1])
-            for name in sim.spec.observes
-            if name in self.system.channels
-        }
+        held = self._judge.parts(state[HELD][rows, 1])
+        before = {name: self._shaped(name, held[name]) for name in sim.spec.observes if name in held}
         rest = [name for name in sim.spec.observes if name not in before]
         before |= dict(self.world.render(_bare(state).at(rows), rest)) if rest else {}
         same = sim.spec.action == self.spec.action
@@ -265,10 +234,8 @@ class Guarded:
             else torch.from_numpy(neutral_action(sim.spec)).expand(int(rows.sum()), *sim.spec.action.shape)
         )
         after = sim.render(sim.imagine(sim.observe(before, None, rng), taken, rng), self.system.channels)
-        seen = {name: part[-1].clone() for name, part in motion.channels.items()}
-        for name, part in after.items():
-            seen[name][rows] = part.double().reshape(len(part), -1)
-        return self._motion(state, seen)
+        flat = torch.cat([after[name].reshape(len(taken), -1).double() for name in self.system.channels], 1)
+        return seen.index_put((rows,), flat)
 
     def _disagrees(self, bare: State, action: Tensor) -> Tensor:
         """bool [B]: a leap and as many single steps under this action end apart."""
@@ -289,43 +256,32 @@ class Guarded:
         return (ends[0] - ends[1]).square().mean(-1).sqrt().cpu()
 
     def _drawn_again(
-        self,
-        state: State,
-        proposal: State,
-        motion: Trajectory,
-        ratios: Tensor,
-        wrong: Tensor,
-        action: Tensor,
-        seeds: Tensor,
-    ) -> tuple[State, Trajectory, Tensor]:
+        self, state: State, proposal: State, ratios: Tensor, wrong: Tensor, action: Tensor, seeds: Tensor
+    ) -> State:
         """The best of several predictions of the broken steps."""
         bare, best = _bare(state), ratios.amax(1) if ratios.shape[1] else ratios.new_zeros(len(ratios))
-        fresh = state[_GUARD + "age"] == 0
+        never = torch.zeros(1, dtype=torch.bool)
         for row in wrong.nonzero()[:, 0].tolist():
             one = torch.tensor([row])
             for draw in range(1, self.config.draws):
                 rng = make_rng((int(seeds[row]) + draw) % 2**62)
                 other = self.world.imagine(bare.at(one), action[one], rng)
-                mine = self._motion(state.at(one), self._seen(other))
-                worst = float(self._ratios(mine, fresh[one]).amax())
+                worst = float(self._judged(state.at(one), self._seen(other), never).before.amax())
                 if worst < float(best[row]):
                     best[row], proposal = worst, proposal.put(one, other)
-        motion = self._motion(state, self._seen(proposal))
-        return proposal, motion, self._ratios(motion, fresh)
+        return proposal
 
-    def _written(self, proposal: State, flat: Mapping[str, Tensor], rows: Tensor, rng: torch.Generator) -> State:
-        """The world's states of these rows, set from the corrected channels."""
-        mine = proposal.at(rows)
-        needed = self.world.spec.observes
-        rest = [name for name in needed if name not in flat]
-        given = {name: self._shaped(name, flat[name][rows]) for name in needed if name in flat}
+    def _written(self, proposal: State, flat: Tensor, rows: Tensor, rng: torch.Generator) -> State:
+        """The world's states of these rows, set from the corrected channels [B, K]."""
+        every = bool(rows.all())
+        mine, parts = (proposal, flat) if every else (proposal.at(rows), flat[rows])
+        needed, seen = self.world.spec.observes, self._judge.parts(parts)
+        rest = [name for name in needed if name not in seen]
+        given = {name: self._shaped(name, seen[name]) for name in needed if name in seen}
         given |= dict(self.world.render(mine, rest)) if rest else {}
         posterior = self.world.observe(given, mine, make_rng(0))
         posterior = posterior.replace(**{name: mine[name] for name in KEPT if name in mine and name in posterior})
-        return proposal.put(rows, posterior)
-
-    def _corrected(self, state: State, name: str) -> Tensor:
-        return self._shaped(name, state[_GUARD + name][:, -1])
+        return posterior if every else proposal.put(rows, posterior)
 
     def _shaped(self, name: str, flat: Tensor) -> Tensor:
         space = self.spec.channels[name]
@@ -357,44 +313,3 @@ def _bare(state: State) -> State:
 
 def _done(state: State) -> Tensor:
     return state["done"].cpu() if "done" in state else torch.zeros(state.batch, dtype=torch.bool)
-
-
-def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
-    """The violation of the last step by a law [B], in tolerances, judged once for each motion. fresh: episodes that have one step
-    only."""
-    if (ratio := motion.memo.get(one.law.name)) is None:
-        whole = one.law.residual(motion)[-1]
-        if fresh.any():
-            whole = torch.where(fresh, one.law.residual(motion.between(1, 3))[-1], whole)
-        ratio = motion.memo[one.law.name] = (whole / one.value).nan_to_num(nan=torch.inf)
-    return ratio
-
-
-def _way(motion: Trajectory) -> Tensor:
-    """The way of all bodies in the last step [B], m; a jump counts as far as the larger speed reaches."""
-    reach = motion.velocity[-2:].norm(dim=-1).amax(0) * motion.dt_s
-    return torch.minimum((motion.position[-1] - motion.position[-2]).norm(dim=-1), reach).sum(-1)
-
-
-def changed_rollouts(before: Trajectory, after: Trajectory) -> Tensor:
-    """bool [B]: the rollouts whose last instant differs."""
-    if before is after:
-        return torch.zeros(before.batch, dtype=torch.bool)
-    parts = [
-        (getattr(before, name), getattr(after, name))
-        for name in ("position", "velocity", "rotation", "spin", "present")
-    ]
-    parts += [(part, after.channels[name]) for name, part in before.channels.items()]
-    return torch.stack([(one[-1] != other[-1]).flatten(1).any(1) for one, other in parts]).any(0)
-
-
-def _mixed(motion: Trajectory, other: Trajectory, rows: Tensor) -> Trajectory:
-    """The rollouts `rows` (bool [B]) of `other`, the rest of `motion`."""
-    parts: dict[str, Any] = {}
-    for name in ("position", "velocity", "rotation", "spin", "present", "radius"):
-        mine, theirs = getattr(motion, name), getattr(other, name)
-        parts[name] = torch.where(rows.view(1, -1, *[1] * (mine.ndim - 2)), theirs, mine)
-    channels = {
-        name: torch.where(rows[None, :, None], other.channels[name], part) for name, part in motion.channels.items()
-    }
-    return replace(motion, **parts, channels=channels)

@@ -95,7 +95,12 @@ class FreeFall:
         """Flight, or the swing on a rod, from the instant before."""
         flies, dt_s, pull = ballistic(motion)[-1][..., None], motion.dt_s, motion.gravity
         before, speed = motion.position[-2], motion.velocity[-2]
-        _, place, velocity = (part[-1] for part in swinging(motion))  # others are as they were
+        hangs, place, velocity = (part[-1] for part in swinging(motion))
+        hangs = hangs[..., None]
+        place, velocity = (
+            torch.where(hangs, place, motion.position[-1]),
+            torch.where(hangs, velocity, motion.velocity[-1]),
+        )
         return with_last(
             motion,
             position=torch.where(flies, before + speed * dt_s + 0.5 * pull * dt_s**2, place),
