@@ -10,6 +10,7 @@ import torch
 from hypothesis import HealthCheck, settings
 
 torch.set_num_threads(1)
+os.fsync = lambda handle: None  # processes are killed here, machines are not: nothing has to wait for the disk
 settings.register_profile(
     "terrella", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
 )

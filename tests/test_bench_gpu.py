@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import pytest
@@ -12,24 +11,31 @@ import pytest
 SCRIPT = Path(__file__).parent.parent / "benchmarks" / "gpu.py"
 
 
-def rehearsed(folder: Path, *only: str) -> list[dict]:
-    out = folder / "bench.json"
-    command = [sys.executable, str(SCRIPT), "--cpu", "--seconds", "0.1", "--out", str(out), "--only", *only]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert done.returncode == 0, done.stdout + done.stderr
-    report = json.loads(out.read_text())
-    assert report["rehearsal"] and "a rehearsal" in done.stdout
-    return report["rows"]
+@pytest.fixture
+def rehearsed(tmp_path, capsys):
+    """rehearsed(rows) -> what was measured of them."""
+    script = runpy.run_path(str(SCRIPT))
+
+    def measured(*only: str) -> list[dict]:
+        settings = script["Settings"](cpu=True, seconds=0.01, out=tmp_path / "bench.json", only=only)
+        assert script["main"](settings) == 0
+        report = json.loads((tmp_path / "bench.json").read_text())
+        assert report["rehearsal"] and "a rehearsal" in capsys.readouterr().out
+        assert {row["what"] for row in report["rows"]} == set(only)
+        return report["rows"]
+
+    return measured
 
 
-def test_it_is_rehearsed_without_a_card(tmp_path):
-    rows = rehearsed(tmp_path, "arm", "flow training")
+def test_it_is_rehearsed_without_a_card(rehearsed):
+    rows = rehearsed("arm", "flow training")
     assert [row["what"] for row in rows] == ["arm", "flow training"]
     assert all(row["per_s"] > 0 and not row["error"] and row["off"] == 0 for row in rows)
     assert rows[0]["kernels"] > 20 and rows[0]["profile"]["kernels"] and rows[0]["profile"]["call sites"]
 
 
 @pytest.mark.slow
-def test_all_of_it_is_rehearsed(tmp_path):
-    rows = rehearsed(tmp_path, "doom-maze", "doom-corridor", "islet", "flow", "latent", "arm", "flow training")
+def test_worlds_are_rehearsed(rehearsed):
+    """A world with depth stands for both: test_dispatch and test_step_program hold the other."""
+    rows = rehearsed("doom-maze", "islet", "flow", "latent")
     assert all(row["per_s"] > 0 and not row["error"] and row["off"] < 2e-3 for row in rows)

@@ -43,7 +43,7 @@ def slow(*case):
 
 
 CASES = [
-    ("with depth", None), slow("with depth", "aot_eager"), slow("with things", "aot_eager"), slow("flow", "aot_eager"),
+    ("with depth", None), slow("with things", "aot_eager"), slow("flow", "aot_eager"),
     slow("flow that scrolls", "aot_eager"), slow("latent", "aot_eager"), ("arm", "aot_eager"),
 ]  # fmt: skip
 
@@ -71,17 +71,18 @@ def test_parts_that_share_a_tensor_are_traced_apart():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "compiler"), [("doom-maze", "eager"), ("doom-corridor", "eager")])
-def test_bundled_worlds_compile_whole(name, compiler):
-    world: Any = terrella.load(name)
-    steps = StepPrograms(world, compiler)
+def test_a_bundled_world_compiles_whole():
+    """Of them all the one with the most parts: things that move, rewards and vitals."""
+    world: Any = terrella.load("doom-corridor")
+    steps = StepPrograms(world, "eager")
     mine, program = walk(world, world.advance, 1, 2), walk(world, steps, 1, 2)
-    assert steps.programs[1].way == f"torch.compile ({compiler})"
+    assert steps.programs[1].way == "torch.compile (eager)"
     off = (mine["rgb"].int() - program["rgb"].int()).abs()
     assert float((off > 2).float().mean()) < 2e-3
 
 
-def test_an_arena_that_grows_is_no_other_world():
+def test_an_arena_that_grows_is_no_other_world(monkeypatch):
+    monkeypatch.setattr(step_program, "ROOM", 8)
     world = place(Controls.buttons(3))
     steps = StepPrograms(world, None)
     with tensor_programs():

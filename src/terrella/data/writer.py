@@ -272,7 +272,9 @@ class Writer:
             row |= {f"stats/{feature}/{key}": value for key, value in summary.items()}
         row |= {f"meta/episodes/{key}": value for key, value in at.items()}
         row |= {"counts": json.dumps(dict(draft.counts))}
-        table = pa.table({name: [value] for name, value in row.items()})
+        # With its type: for each value whose type it infers, PyArrow looks for pandas again where there is none.
+        form = pa.struct([(name, _type_of(value)) for name, value in row.items()])
+        table = pa.Table.from_batches([pa.RecordBatch.from_struct_array(pa.array([row], form))])
         return table.append_column("start_ns", pa.array([draft.start_ns], pa.int64()))
 
     def _info(self, episodes: int, rows: int, tasks: int) -> dict:
@@ -284,6 +286,13 @@ class Writer:
             "video_path": VIDEO_PATH if any(f["dtype"] == "video" for f in self.features.values()) else None,
             "features": self.features,
         }  # fmt: skip
+
+
+def _type_of(value: object) -> pa.DataType:
+    """The type that PyArrow infers of an int, a float, a string, or a list of one of them."""
+    if isinstance(value, list):
+        return pa.list_(_type_of(value[0]) if value else pa.null())
+    return {int: pa.int64(), float: pa.float64(), str: pa.string()}[type(value)]
 
 
 def _without_padding(of_episode: Mapping[str, stats.Summary], counts: Mapping[str, int]) -> dict[str, stats.Summary]:

@@ -1,4 +1,7 @@
-"""Cuts pictures on surfaces into rectangles of nearly one colour, small where the picture has detail (layout/cells.py)."""
+"""Cuts pictures on surfaces into rectangles of nearly one colour, small where the picture has detail (layout/cells.py).
+
+Rows are copied number by number: Numba takes several times as long to compile whole arrays that are assigned or added.
+"""
 
 import heapq
 
@@ -67,13 +70,14 @@ def _best_cut(sums, many, other, slim):
     for i in range(many):
         for m in range(6):
             total[m] += sums[i, m]
-    left, best, where = np.zeros(6), np.inf, many // 2
+    left, rest, best, where = np.zeros(6), np.zeros(6), np.inf, many // 2
     for i in range(1, many):
         for m in range(6):
             left[m] += sums[i - 1, m]
         if i < slim or many - i < slim:
             continue
-        rest = total - left
+        for m in range(6):
+            rest[m] = total[m] - left[m]
         here = _error(i * other, left[:4], left[4:]) + _error((many - i) * other, rest[:4], rest[4:])
         uneven = abs(2 * i - many) / many
         here = here * (1 + 0.2 * uneven) + 1e-9 * uneven
@@ -98,7 +102,8 @@ def _cut(node, face, starts, counts, steps, longest, picture, kinds, rows_of, co
     if rows == 1 or columns == 1:
         across = columns == 1
     parts = np.empty((2, 4), np.int64)
-    parts[:] = node
+    for m in range(4):
+        parts[0, m] = parts[1, m] = node[m]
     if across:
         parts[0, 1] = parts[1, 0] = r0 + i
     else:
@@ -124,7 +129,24 @@ def _stats(node, start, columns, picture, kinds):
     n = (r1 - r0) * (c1 - c0)
     colour = s[3] - (s[0] * s[0] + s[1] * s[1] + s[2] * s[2]) / n
     middle = kinds[start + (r0 + r1) // 2 * columns + (c0 + c1) // 2]
-    return s[:3] / n, max(colour, 0.0), max(k[1] - k[0] * k[0] / n, 0.0), middle
+    mean = s[:3]
+    for m in range(3):
+        mean[m] /= n
+    return mean, max(colour, 0.0), max(k[1] - k[0] * k[0] / n, 0.0), middle
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mean(out, node, start, columns, picture, kinds):
+    """Writes the mean colour [3] of a node."""
+    mean, _, _, _ = _stats(node, start, columns, picture, kinds)
+    for m in range(3):
+        out[m] = mean[m]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _distance(one, other):
+    """The largest difference of two colours [3]."""
+    return max(abs(one[0] - other[0]), abs(one[1] - other[1]), abs(one[2] - other[2]))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -140,7 +162,8 @@ def cut(starts, counts, steps, longest, weights, picture, kinds, most):
     heap.pop()
     used = leaves = 0
     for f in range(len(starts)):
-        nodes[used, 0], nodes[used, 1:] = f, np.array([0, counts[f, 0], 0, counts[f, 1]])
+        nodes[used, 0], nodes[used, 1], nodes[used, 3] = f, 0, 0
+        nodes[used, 2], nodes[used, 4] = counts[f, 0], counts[f, 1]
         used, leaves = _add(used, nodes, starts, counts, steps, longest, weights, picture, kinds, heap, kept, leaves)
     while len(heap) > 0 and used < size - 2:
         key, at = heapq.heappop(heap)
@@ -152,13 +175,13 @@ def cut(starts, counts, steps, longest, weights, picture, kinds, most):
         kept[at] = False
         for p in range(2):
             place = at if p == 0 else used
-            nodes[place, 0], nodes[place, 1:] = f, parts[p]
-            if p == 0:
-                _, leaves = _add(at, nodes, starts, counts, steps, longest, weights, picture, kinds, heap, kept, leaves)
-            else:
-                used, leaves = _add(
-                    used, nodes, starts, counts, steps, longest, weights, picture, kinds, heap, kept, leaves
-                )
+            nodes[place, 0] = f
+            for m in range(4):
+                nodes[place, 1 + m] = parts[p, m]
+            after, leaves = _add(
+                place, nodes, starts, counts, steps, longest, weights, picture, kinds, heap, kept, leaves
+            )
+            used = max(used, after)
     return nodes[:used][kept[:used]]
 
 
@@ -190,11 +213,12 @@ def grade(cells, starts, counts, steps, picture, kinds, edges, most):
     size = max(most, len(cells))
     near = np.zeros(size, np.int64)
     out, means = np.empty((size, 5), np.int64), np.empty((size, 3))
-    out[: len(cells)] = cells
     for n in range(len(cells)):
+        for m in range(5):
+            out[n, m] = cells[n, m]
         _paint(out[n], n, starts, counts, owner)
         f = out[n, 0]
-        means[n], _, _, _ = _stats(out[n, 1:], starts[f], counts[f, 1], picture, kinds)
+        _mean(means[n], out[n, 1:], starts[f], counts[f, 1], picture, kinds)
     used = len(cells)
     for inner in (0, 1, 1):  # edges first
         n = 0
@@ -211,15 +235,16 @@ def grade(cells, starts, counts, steps, picture, kinds, edges, most):
                 continue
             first, last = (1, 2) if side < 2 else (3, 4)
             new = out[used]
-            new[:] = out[n]
+            for m in range(5):
+                new[m] = out[n, m]
             if side % 2 == 0:
                 new[last] = out[n, first] + short
                 out[n, first] = new[last]
             else:
                 new[first] = out[n, last] - short
                 out[n, last] = new[first]
-            means[used], _, _, _ = _stats(new[1:], starts[f], counts[f, 1], picture, kinds)
-            means[n], _, _, _ = _stats(out[n, 1:], starts[f], counts[f, 1], picture, kinds)
+            _mean(means[used], new[1:], starts[f], counts[f, 1], picture, kinds)
+            _mean(means[n], out[n, 1:], starts[f], counts[f, 1], picture, kinds)
             near[used] = near[n] | (1 if side < 2 else 2) * grown
             _paint(new, used, starts, counts, owner)
             used += 1
@@ -280,7 +305,7 @@ def _short(cell, n, starts, counts, owner, cells, means, near):
             theirs = cells[other, 2] - cells[other, 1] if side < 2 else cells[other, 4] - cells[other, 3]
             grown = (near[other] >> (0 if side < 2 else 1)) & 1
             ratio = GROWTH if grown else GRADED
-            if long_ <= ratio * theirs + 1 or not (grown or np.abs(means[other] - means[n]).max() >= CONTRAST):
+            if long_ <= ratio * theirs + 1 or not (grown or _distance(means[other], means[n]) >= CONTRAST):
                 continue
             return side, max(int(ratio * theirs), 1), grown
     return -1, 0, 0
@@ -302,6 +327,8 @@ def shown(cells, starts, counts, picture, kinds, edges, sharper, out, kind, cont
                     many += 1
                     for c in range(3):
                         total[c] += picture[start + i * columns + j, c]
-        off = mean - total / max(many, 1) if many else np.zeros(3)
-        out[n], contrast[n] = mean + sharper * off, np.abs(off).max()
+        contrast[n] = 0.0
+        for c in range(3):
+            off = mean[c] - total[c] / many if many else 0.0
+            out[n, c], contrast[n] = mean[c] + sharper * off, max(contrast[n], abs(off))
         bits[n] = _open(cells[n], start, columns, edges)
