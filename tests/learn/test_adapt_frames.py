@@ -82,8 +82,8 @@ def test_it_goes_on_from_the_world_and_measures_both_recordings(made, tmp_path, 
 @pytest.mark.slow
 def test_it_learns_the_other_camera_and_forgets_less_where_it_rehearses(made, tmp_path):
     _, old, new = made
-    train_video(old, tmp_path / "old", replace(TINY, steps=400), quiet)
-    world, many = load_world(tmp_path / "old" / "world"), replace(FEW, steps=400)
+    train_video(old, tmp_path / "old", replace(TINY, steps=150), quiet)
+    world, many = load_world(tmp_path / "old" / "world"), replace(FEW, steps=200)
     alone = adapt(world, new, tmp_path / "alone", many, quiet)["errors"]["new"]
     both = adapt(world, new, tmp_path / "both", many, quiet, old)["errors"]
     assert alone["after"]["8"] < 0.7 * alone["before"]["8"]

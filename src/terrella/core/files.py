@@ -77,8 +77,9 @@ def write_text(target: str | Path, text: str) -> None:
     write_bytes(target, text.encode())
 
 
-def write_json(target: str | Path, value: object, indent: int = 2) -> None:
-    """Replaces `target` by `value` as indented JSON, durably. ValueError for NaN and infinity."""
+def write_json(target: str | Path, value: object, indent: int | None = 2) -> None:
+    """Replaces `target` by `value` as JSON, durably; without indentation (None) many times as fast. ValueError for NaN and
+    infinity."""
     write_text(target, json.dumps(value, indent=indent, allow_nan=False) + "\n")
 
 

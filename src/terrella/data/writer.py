@@ -121,7 +121,7 @@ class Writer:
         for path, file in staged.items():
             files.move_into_place(file, self.root / path)
         merged = stats.merge([self._stats, _without_padding(of_episode, draft.counts)])
-        files.write_json(self.root / STATS, stats.to_json(merged))
+        files.write_json(self.root / STATS, stats.to_json(merged), indent=None)
         with files.replacing(self.root / TASKS) as path:
             pq.write_table(tasks_table(tasks), as_local(path), **_CHECKED)
         files.write_json(self.root / INFO, self._info(number + 1, self.rows + draft.length, len(tasks)))
