@@ -31,7 +31,8 @@ def test_the_guides_code_runs_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(LearnSchedule, "share_s", property(lambda schedule: shares))
     monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 4)
     monkeypatch.setattr(practise, "ROUNDS", 1)
-    monkeypatch.setattr(practise, "HOPELESS_STEPS", 0)  # a slow machine refuses these few seconds
+    for module in ("practise", "learn_trial"):  # a slow machine refuses these few seconds
+        monkeypatch.setattr(f"terrella.workflows.{module}.HOPELESS_STEPS", 0)
     monkeypatch.setattr(practise, "TRIAL_EPISODES", 2)
     code = "\n".join(re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL))
     for long, short in SHORT.items():

@@ -105,11 +105,11 @@ def test_a_bundled_world_knows_its_ceiling_and_how_it_drifts(name):
 
 
 @pytest.mark.slow
-def test_an_explorer_in_the_maze_is_lost_after_400_steps_but_invents_little():
+def test_an_explorer_in_the_maze_is_lost_after_600_steps_but_invents_little():
     world, rng = terrella.load("doom-maze"), make_rng(0)
     policy, state = Explorer(world.spec), world.start(1, rng)
     memory, seen = policy.begin(1, rng), []
-    for step in range(400):
+    for step in range(600):
         action, memory = policy.act(world.render(state, world.spec.observes), memory, rng)
         state = world.imagine(state, action, rng)
         if step % 20 == 0:

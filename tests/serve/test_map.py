@@ -81,7 +81,7 @@ def inside(page) -> np.ndarray:
       [copy.width, copy.height] = [shown.width, shown.height];
       const context = copy.getContext('2d');
       context.drawImage(shown, 0, 0);
-      return [[copy.height, copy.width], Array.from(context.getImageData(0, 0, copy.width, copy.height).data)];
+      return [[copy.height, copy.width], context.getImageData(0, 0, copy.width, copy.height).data];
     }""")
     return np.array(data, np.uint8).reshape(*size, 4)[..., :3]
 

@@ -17,7 +17,7 @@ PICTURE = """index => {
   copy.width = shown.width; copy.height = shown.height;
   const context = copy.getContext('2d');
   context.drawImage(shown, 0, 0);
-  return [copy.height, copy.width, terrella.step, Array.from(context.getImageData(0, 0, copy.width, copy.height).data)];
+  return [copy.height, copy.width, terrella.step, context.getImageData(0, 0, copy.width, copy.height).data];
 }"""
 
 

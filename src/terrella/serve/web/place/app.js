@@ -304,7 +304,7 @@ function run({ drawing, source, story, solid: first }) {
       paint();
       const { gl } = drawing, { width, height } = canvas, data = new Uint8Array(4 * width * height);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
-      return { width, height, data: Array.from(data) };
+      return { width, height, data };
     },
   };
 }
