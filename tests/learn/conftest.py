@@ -1,6 +1,11 @@
-"""Small worlds that many tests of this room share: trained once."""
+"""Small worlds that many tests of this room share: trained once, by whichever process of pytest-xdist is the first."""
 
 from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from tests.data.corridor import Corridor
@@ -17,9 +22,29 @@ from terrella.learn.recipes.video import train_video
 from terrella.worlds.folder import load_world
 
 
-def recorded(world, folder, rows: int = 300):
-    record(world, Explorer(world.spec), folder, rows, make_rng(0), options=RecordOptions(max_episode_steps=80))
-    return folder
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory, request):
+    """shared(name, make) -> the folder that make(folder) filled, and the facts that it returned."""
+    root = tmp_path_factory.getbasetemp()
+    root = (root.parent if hasattr(request.config, "workerinput") else root) / "shared"
+    root.mkdir(exist_ok=True)
+
+    def made(name: str, make: Callable[[Path], dict | None]) -> tuple[Path, dict]:
+        folder, facts = root / name, root / f"{name}.json"
+        with open(root / f"{name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not facts.exists():
+                facts.write_text(json.dumps(make(folder)))
+        return folder, json.loads(facts.read_text())
+
+    return made
+
+
+def recorded(shared, name: str, world) -> Path:
+    def make(folder: Path) -> None:
+        record(world, Explorer(world.spec), folder, 300, make_rng(0), options=RecordOptions(max_episode_steps=80))
+
+    return shared(name, make)[0]
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -31,60 +56,53 @@ def few_scroll_steps():
 
 
 @pytest.fixture(scope="session")
-def corridor(tmp_path_factory):
+def corridor(shared):
     """A recording with depth and poses, in which nothing moves."""
-    return recorded(Corridor(), tmp_path_factory.mktemp("corridor") / "set")
+    return recorded(shared, "corridor", Corridor())
 
 
 @pytest.fixture(scope="session")
-def haunted(tmp_path_factory):
+def haunted(shared):
     """A recording with depth and poses that marks what moves, and has a vital."""
-    return recorded(Haunted(), tmp_path_factory.mktemp("haunted") / "set")
-
-
-def trained(tmp_path_factory, data, config):
-    out = tmp_path_factory.mktemp("run")
-    return out, train_video(data, out, config, quiet)
+    return recorded(shared, "haunted", Haunted())
 
 
 @pytest.fixture(scope="session")
-def posed_run(corridor, tmp_path_factory):
+def posed_run(shared, corridor):
     """The folder and the facts of a run with all senses."""
-    return trained(tmp_path_factory, corridor, POSED)
+    return shared("posed", lambda out: train_video(corridor, out, POSED, quiet))
 
 
 @pytest.fixture(scope="session")
-def bare_run(corridor, tmp_path_factory):
+def bare_run(shared, corridor):
     """The same without estimator and uncertainty."""
-    return trained(tmp_path_factory, corridor, BARE)
+    return shared("bare", lambda out: train_video(corridor, out, BARE, quiet))
 
 
 @pytest.fixture(scope="session")
-def flat_run(corridor, tmp_path_factory):
+def flat_run(shared, corridor):
     """A world with an uncertainty, of the frames and actions of the same recording."""
-    return trained(tmp_path_factory, corridor, FLAT)
+    return shared("flat", lambda out: train_video(corridor, out, FLAT, quiet))
 
 
 @pytest.fixture(scope="session")
-def haunted_run(haunted, tmp_path_factory):
-    return trained(tmp_path_factory, haunted, BARE)
+def haunted_run(shared, haunted):
+    return shared("haunted-run", lambda out: train_video(haunted, out, BARE, quiet))
 
 
 @pytest.fixture(scope="session")
-def teacher(corridor, tmp_path_factory):
+def teacher(shared, corridor):
     """A world of four steps a frame."""
-    return load_world(trained(tmp_path_factory, corridor, TEACHER)[0] / "world")
+    return load_world(shared("teacher", lambda out: train_video(corridor, out, TEACHER, quiet))[0] / "world")
 
 
 @pytest.fixture(scope="session")
-def student_run(corridor, teacher, tmp_path_factory):
+def student_run(shared, corridor, teacher):
     """A distillation of the teacher."""
-    out = tmp_path_factory.mktemp("student")
-    return out, distil(teacher, corridor, out, STUDENT, quiet)
+    return shared("student", lambda out: distil(teacher, corridor, out, STUDENT, quiet))
 
 
 @pytest.fixture(scope="session")
-def dreams_run(corridor, teacher, tmp_path_factory):
+def dreams_run(shared, corridor, teacher):
     """The teacher, trained on its own rollouts."""
-    out = tmp_path_factory.mktemp("dreams")
-    return out, train_dreams(teacher, corridor, out, DREAMS, quiet)
+    return shared("dreams", lambda out: train_dreams(teacher, corridor, out, DREAMS, quiet))
