@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import resource
 import shutil
 import sys
@@ -57,7 +56,6 @@ KINDS = {  # what may be damaged -> the file of episode 1, or of all
     "growing film": f".staging/stream-{SIDE}.growing.mp4",
 }
 OF_EPISODE = ("data", "video", "stream", "film", "times", "episodes")
-os.fsync = lambda handle: None  # nothing has to wait for the disk
 MEMORY = 3 << 30  # bytes beyond what the imports take
 
 

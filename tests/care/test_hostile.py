@@ -28,8 +28,7 @@ from terrella.data.source import Sensor
 DATA, EPISODES = "data/chunk-000/file-001.parquet", "meta/episodes/chunk-000/file-001.parquet"
 VIDEO = "videos/observation.images.rgb/chunk-000/file-001.mp4"
 WORKER = """
-import json, os, sys, time
-os.fsync = lambda handle: None  # nothing has to wait for the disk
+import json, sys, time
 from pathlib import Path
 from terrella.core.errors import DatasetError
 from terrella.care import doctor, repair

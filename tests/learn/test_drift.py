@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -53,7 +55,8 @@ def test_a_walk_of_1000_steps_drifts_up_to_the_ceiling_and_invents_no_more_than_
     network = UncertaintyNetwork(UncertaintyConfig())
     network.ceiling.fill_(0.15)
     world, rng = place(Controls.buttons(2)).replaced(uncertainty=network), make_rng(0)
-    assert isinstance(world.body.motion, Motion)
+    body: Any = world.body
+    assert isinstance(body.motion, Motion)
     state, gone, seen = world.start(1, rng), [], []
     for step in range(1, 1001):
         state = world.imagine(state, torch.tensor([[step // 7 % 2, 1]], dtype=torch.int8), rng)
@@ -70,7 +73,7 @@ def test_a_walk_of_1000_steps_drifts_up_to_the_ceiling_and_invents_no_more_than_
 
 @pytest.mark.slow
 def test_rollouts_along_a_recording_are_those_of_the_seed(corridor, posed_run):
-    world = load_world(posed_run[0] / "world")
+    world: Any = load_world(posed_run[0] / "world")
     cache = ClipCache.open(Dataset(corridor), (24, 32))
     recording = Recording.of(cache, split(len(cache.episodes))[0], None)
     one, other = (drift_frames(world, recording, 8, 2, seed=3) for _ in range(2))
@@ -89,7 +92,7 @@ def test_an_older_world_expects_no_more_than_it_was_calibrated_to(posed_run, tmp
     save_file(
         {name: part for name, part in weights.items() if name not in ("uncertainty.ceiling", "uncertainty.drift")}, path
     )
-    older = load_world(tmp_path / "world").uncertainty
+    older: Any = load_world(tmp_path / "world").uncertainty
     assert (
         float(older.ceiling) == float(older.errors[-1]) and float(older.calibrated(torch.tensor(9.0))) <= older.ceiling
     )
@@ -97,7 +100,8 @@ def test_an_older_world_expects_no_more_than_it_was_calibrated_to(posed_run, tmp
 
 @pytest.mark.parametrize("name", BUNDLED)
 def test_a_bundled_world_knows_its_ceiling_and_how_it_drifts(name):
-    network = terrella.load(name).uncertainty
+    world: Any = terrella.load(name)
+    network = world.uncertainty
     far = torch.tensor([[1.0, 0, 0, 0, 0], [1000.0, 70, 20, 0, 0]])
     near, away = network.drifts(far).tolist()
     assert 0.03 < float(network.ceiling) < 0.3 and near < 0.3 < away <= 1
@@ -106,7 +110,8 @@ def test_a_bundled_world_knows_its_ceiling_and_how_it_drifts(name):
 
 @pytest.mark.slow
 def test_an_explorer_in_the_maze_is_lost_after_600_steps_but_invents_little():
-    world, rng = terrella.load("doom-maze"), make_rng(0)
+    world: Any = terrella.load("doom-maze")
+    rng = make_rng(0)
     policy, state = Explorer(world.spec), world.start(1, rng)
     memory, seen = policy.begin(1, rng), []
     for step in range(600):

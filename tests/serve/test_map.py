@@ -125,7 +125,7 @@ def test_rewinding_takes_the_map_along(serve_world, open_page):  # noqa: F811
 def test_inventions_can_be_tinted(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Mapped()]).url)
 
-    def colours() -> tuple[float, float]:
+    def colours() -> tuple[float, ...]:
         """Blue less red of the left half, which it invents, and of the right one."""
         _, seen = picture(page)
         half = seen.shape[1] // 2

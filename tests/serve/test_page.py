@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -215,7 +216,7 @@ def test_a_wrong_token_is_explained(serve_world, browser):
 
 
 def test_a_broken_world_offers_a_restart(serve_world, open_page, capsys):
-    world = Panorama()
+    world: Any = Panorama()
     world.breaks_at = 12
     page = open_page(serve_world([world]).url)
     until(page, "terrella.state === 'failed'")

@@ -125,7 +125,7 @@ def test_dragging_scrubs_and_the_wheel_zooms(open_view):
     page.mouse.down()
     page.mouse.move(x + box["width"] / 4, y)
     page.mouse.up()
-    length = max(float(own.time_s[-1]) for own in next(rig.lively().takes()).readings.values())
+    length = max(float(own.time_s[-1]) for own in next(iter(rig.lively().takes())).readings.values())
     assert page.evaluate("viewer.time") == pytest.approx(0.75 * length, rel=0.01)
     page.mouse.wheel(0, -600)
     until(page, f"viewer.range[1] - viewer.range[0] < {0.5 * length}")
