@@ -11,9 +11,18 @@ from hypothesis import strategies as st
 
 from terrella.space.camera import planar_pose, project, unproject, yaw
 from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
-from terrella.space.keyframes import Keyframes, doubled, gathered, look, look_slowly, retrieve, retrieve_slowly
+from terrella.space.keyframes import (
+    Keyframes,
+    doubled,
+    gathered,
+    look,
+    look_and_carry,
+    look_slowly,
+    retrieve,
+    retrieve_slowly,
+)
 from terrella.space.patches import FAR_M, patches, patches_slowly
-from terrella.space.reproject import fill_holes, warp
+from terrella.space.reproject import carry_unknown_slowly, fill_holes, warp
 
 from .rooms import CAMERA, SIZE, cast, cast_slowly, painted, pose_at, room_depth
 
@@ -132,8 +141,16 @@ def test_the_compiled_look_equals_its_slow_twin(lots):
     own = as_kept(four()) if lots != "shared" else Keyframes.none(SIZE)
     picks = {"shared": [[0, 1, 3], [2, -1, -1]], "own": [[1, 2, 4], [3, -1, -1]], "both": [[0, 6, 3], [5, 1, -1]]}[lots]
     picks = torch.tensor([*picks, [-1, -1, -1]])
-    fast = look(shared, picks, VIEWS, CAMERA, SIZE, 4, own)
-    slow = look_slowly(shared, picks, VIEWS, CAMERA, SIZE, 4, own)
+    shown = Keyframes.joined([keyframe(0.2, 0.1 * n, 0.1) for n in range(3)])
+    last = shown.rgb, shown.depth, shown.pose
+    fast, carried = look_and_carry(shared, picks, VIEWS, CAMERA, SIZE, 4, own, last)
+    slow, merged = look_slowly(shared, picks, VIEWS, CAMERA, SIZE, 4, own, last)
+    alone, none = look_slowly(shared, picks, VIEWS, CAMERA, SIZE, 4, own)
+    assert none is None and all(torch.equal(part, vars(slow)[name]) for name, part in vars(alone).items())
+    apart = carry_unknown_slowly(*last, slow.known, slow.depth, VIEWS, CAMERA)
+    assert carried is not None and merged is not None and (apart[:, 3] > 0).float().mean() > 0.005
+    torch.testing.assert_close(merged, apart, atol=1e-5, rtol=1e-4)
+    assert float(torch.isclose(merged, carried, atol=1e-3).float().mean()) > 0.97, "where the views are alike"
     assert fast.trust[0, 1].max() > 0.3 and fast.known[2].max() == 0 and fast.trust[:, 3].max() == 0
     for name, far in (("trust", 1e-3), ("depth", 1e-2), ("known", 0.5)):
         assert ((vars(fast)[name] - vars(slow)[name]).abs() > far).float().mean() < 0.01, name

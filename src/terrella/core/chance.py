@@ -47,9 +47,9 @@ def uniforms(seeds: torch.Tensor, shapes: Mapping[int, Sequence[int]]) -> dict[i
 def normal(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> torch.Tensor:
     """float32 [B, *shape], standard normal (Box & Muller 1958)."""
     count = math.prod(shape)
-    high, low = _halves(seeds, (count + 1) // 2, stream)
-    radius, angle = high.add_(2.0**-25).log_().mul_(-2).sqrt_(), low.mul_(2 * math.pi)
-    both = torch.view_as_real(torch.polar(radius, angle)).mT
+    high, low = _shares_and_angles(seeds, (count + 1) // 2, stream)
+    radius = torch.xlogy(constant(torch.tensor, high.device, -2.0), high).sqrt_()
+    both = torch.view_as_real(torch.polar(radius, low)).mT
     return both.flatten(1)[:, :count].reshape(len(seeds), *shape)
 
 
@@ -65,6 +65,20 @@ def chosen(point: torch.Tensor, probabilities: torch.Tensor) -> torch.Tensor:
     return picked.clamp_max(probabilities.shape[-1] - 1)
 
 
+def _shares_and_angles(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Numbers [B, count] above 0 and up to 1, and angles [B, count]."""
+    if kernels_do(seeds):
+        high, low = _halves(seeds, count, stream)
+        return high.add_(2.0**-25), low.mul_(2 * math.pi)
+    whole = _hashes(seeds, count, stream) & 0xFFFFFF
+    above, unit = (constant(torch.tensor, seeds.device, row)[:, None, None] for row in (_ABOVE, _UNIT))
+    high, low = torch.addcmul(above, whole, unit).unbind(0)
+    return high, low
+
+
+_ABOVE, _UNIT = (2.0**-25, 0.0), (2.0**-24, 2 * math.pi * 2.0**-24)
+
+
 def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The upper and the lower half of `count` hashes of each seed, as float32 [B, count] in [0, 1), multiples of 2**-24."""
     if not kernels_do(seeds):
@@ -76,10 +90,14 @@ def _halves(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor,
 
 def _halves_slowly(seeds: torch.Tensor, count: int, stream: int) -> tuple[torch.Tensor, torch.Tensor]:
     """The same as `_halves` in plain tensor algebra, for GPUs."""
-    key = _mixed(seeds + constant(_stream, seeds.device, stream))[:, None]
-    mixed = _mixed(key + constant(_steps, seeds.device, count))[None]
-    high, low = _scaled(mixed, constant(_shifts, seeds.device)).unbind(0)
+    high, low = ((_hashes(seeds, count, stream) & 0xFFFFFF) * 2.0**-24).unbind(0)
     return high, low
+
+
+def _hashes(seeds: torch.Tensor, count: int, stream: int) -> torch.Tensor:
+    """int64 [2, B, count], of which the lower 24 bits are the upper and the lower half of hashes."""
+    key = _mixed(seeds + constant(_stream, seeds.device, stream))[:, None]
+    return _mixed(key + constant(_steps, seeds.device, count))[None] >> constant(_shifts, seeds.device)
 
 
 def _layout(streams: tuple[int, ...], counts: tuple[int, ...]) -> torch.Tensor:

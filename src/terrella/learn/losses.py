@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ..space.keyframes import Glimpse, merge
+from ..space.keyframes import Glimpse
 from .batches import Batch
 from .devices import half_precision
 from .learners import Learner
@@ -22,7 +22,7 @@ class PatchCritic(nn.Module):
         self.judge = nn.utils.parametrizations.spectral_norm(nn.Conv2d(widths[-1], 1, 3, 1, 1))
 
     def forward(self, rgb: torch.Tensor, glimpse) -> torch.Tensor:
-        x = torch.cat([rgb, merge(glimpse) * 2 - 1, glimpse.known[:, None]], 1)
+        x = torch.cat([rgb, glimpse.merged * 2 - 1, glimpse.known[:, None]], 1)
         for layer in self.layers:
             x = F.leaky_relu(layer(x), 0.2)
         return self.judge(x)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 
@@ -17,7 +18,7 @@ from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
 from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
-from .reproject import fill_holes, warp
+from .reproject import carry_unknown, colours_at, fill_holes, sight, unknown_alone
 from .views import arrays, over_views
 
 COARSE, FINE = 8, 2  # strides of the patches for finding keyframes and for the view's depth
@@ -93,6 +94,11 @@ def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple
     return Keyframes.joined(some) if some else Keyframes.none(size), picks
 
 
+RgbdFrame = tuple[
+    torch.Tensor, torch.Tensor, torch.Tensor
+]  # rgb uint8 [B, 3, H, W], depth [B, h, w] metres, pose [B, 7]
+
+
 @dataclass(frozen=True)
 class Glimpse:
     """What is known of B views: colours [B, slots, 3, H, W] in [0, 1] and their trust [B, slots, H, W], best first; depth of the
@@ -103,14 +109,18 @@ class Glimpse:
     depth: torch.Tensor
     known: torch.Tensor
 
+    def each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Glimpse:
+        """With each of its tensors changed."""
+        return Glimpse(*(change(getattr(self, field.name)) for field in fields(self)))
+
     def to(self, device) -> Glimpse:
-        return Glimpse(*(getattr(self, field.name).to(device) for field in fields(self)))
+        return self.each(lambda part: part.to(device))
 
-
-def merge(glimpse: Glimpse) -> torch.Tensor:
-    """The colours averaged with the squared trust of the slots: [B, 3, H, W] in [0, 1]."""
-    weight = (glimpse.trust + 1e-4).square()
-    return (glimpse.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
+    @cached_property
+    def merged(self) -> torch.Tensor:
+        """The colours averaged with the squared trust of the slots: [B, 3, H, W] in [0, 1]."""
+        weight = (self.trust + 1e-4).square()
+        return (self.rgb * weight[:, :, None]).sum(1) / weight.sum(1)[:, None]
 
 
 # -- which keyframes --------------------------------------------------------------------------------------------------
@@ -219,9 +229,22 @@ def look(
     own: Keyframes | None = None,
 ) -> Glimpse:  # fmt: skip
     """The views of `size` from `pose` [B, 7], from the picked keyframes [B, S] (see `retrieve`)."""
+    return look_and_carry(shared, picks, pose, camera, size, slots, own)[0]
+
+
+def look_and_carry(
+    shared: Keyframes, picks: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int,
+    own: Keyframes | None = None, last: RgbdFrame | None = None,
+) -> tuple[Glimpse, torch.Tensor | None]:  # fmt: skip
+    """`look`, and where that knows nothing, what the `last` frame (rgb, depth, pose) shows: as `carry_unknown` gives it."""
     own = Keyframes.none(size, pose.device) if own is None else own
     if not kernels_do(pose):
-        return look_slowly(shared, picks, pose, camera, size, slots, own)
+        return look_slowly(shared, picks, pose, camera, size, slots, own, last)
+    glimpse = _look_quickly(shared, picks, pose, camera, size, slots, own)
+    return glimpse, None if last is None else carry_unknown(*last, glimpse.known, glimpse.depth, pose, camera)
+
+
+def _look_quickly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
     batch, (height, width) = len(pose), size
     depth = torch.full((batch, height, width), FAR_M)
     turns, positions, chosen = arrays(rotation(pose), pose[:, :3], picks)
@@ -237,13 +260,15 @@ def look(
     return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
 
 
-def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
-    """The same as `look`, in plain tensor algebra, also for GPUs."""
+def look_slowly(
+    shared, picks, pose, camera, size, slots, own, last: RgbdFrame | None = None
+) -> tuple[Glimpse, torch.Tensor | None]:
+    """The same as `look_and_carry`, in plain tensor algebra, also for GPUs."""
     batch, valid, mine = len(pose), picks >= 0, picks >= len(shared)
     if not picks.shape[1] or not len(shared) + len(own):
-        nothing = pose.new_zeros(batch, slots, 3, *size)
-        return Glimpse(nothing, nothing[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
-
+        none = pose.new_zeros(batch, slots, 3, *size)
+        nothing = Glimpse(none, none[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
+        return nothing, None if last is None else carry_unknown(*last, nothing.known, nothing.depth, pose, camera)
     theirs, ours = picks.clamp(0, max(0, len(shared) - 1)), (picks - len(shared)).clamp_min(0)
 
     def both(part: str, change: Callable[[torch.Tensor], torch.Tensor] = lambda tensor: tensor) -> torch.Tensor:
@@ -265,17 +290,23 @@ def look_slowly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
     depth = cast(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
     hit = depth < FAR_M
     depth = fill_holes(depth)
-    keys = rgb, key_depth, poses, turns
-    colours, trust = recall_slowly(keys, valid, depth, (pose, turn), camera, slots)
-    return Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
+    if last is not None:  # as one keyframe more, whose colours are taken apart
+        key_depth, poses = (torch.cat([one, other[:, None]], 1) for one, other in zip((key_depth, poses), last[1:]))
+        turns = torch.cat([turns, rotation(last[2])[:, None]], 1)
+    places, agreement, near = sight(key_depth, poses, turns, depth, (pose, turn), camera)
+    keys = picks.shape[1]
+    shown = colours_at(rgb, places[:, :keys]), agreement[:, :keys], depth[:, None] / near[:, :keys]
+    colours, trust = best_slowly(*shown, valid, slots)
+    glimpse = Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
+    if last is None:
+        return glimpse, None
+    colour, trust = colours_at((last[0] / 255)[:, None], places[:, keys:])[:, 0], agreement[:, keys:]
+    return glimpse, unknown_alone(colour, trust, glimpse.known)
 
 
-def recall_slowly(keys, valid, seen, view, camera, slots) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most trusted colours [B, slots, 3, H, W] of the surfaces at depth `seen` [B, H, W] in a view = pose [B, 7] and rotation
-    [B, 3, 3], and their trust [B, slots, H, W]; keys: keyframes' rgb [B, S, 3, h, w] in [0, 1], depth [B, S, h, w], poses
-    [B, S, 7] and rotations [B, S, 3, 3], `valid` [B, S]."""
-    (rgb, depth, poses, turns), (pose, turn) = keys, view
-    colour, agreement, closeness = warp(rgb, depth, poses, seen, pose, camera, turns, turn)
+def best_slowly(colour, agreement, closeness, valid, slots) -> tuple[torch.Tensor, torch.Tensor]:
+    """The most trusted colours [B, slots, 3, H, W] and their trust [B, slots, H, W], of what S keyframes show: as `warp` gives it,
+    `valid` [B, S]."""
     likeness = torch.minimum(closeness, closeness.clamp_min(1e-3).reciprocal()).clamp_min(0.05)
     sure = where(valid[..., None, None], agreement * likeness.square(), -1.0)
     # of equals the first, as the kernel does

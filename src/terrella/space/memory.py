@@ -16,7 +16,7 @@ from ..core.state import State
 from .camera import Intrinsics, yaw
 from .floorplan import NOWHERE, WALLS
 from .kernels_numba import recall as kernels
-from .keyframes import COARSE, Glimpse, Keyframes, look, retrieve, vote_slowly
+from .keyframes import COARSE, Glimpse, Keyframes, RgbdFrame, look_and_carry, retrieve, vote_slowly
 from .patches import patch_count
 from .views import arrays, over_views
 
@@ -229,11 +229,18 @@ class Memory:
     ) -> Glimpse:
         """What is known of the views from `pose` [B, 7], by memory and by `recorded` keyframes that all episodes share. At most
         `sources` keyframes are used for a view, and at most `slots` for a pixel."""
+        return self.look_and_carry(held, pose, None, sources, slots, recorded)[0]
+
+    def look_and_carry(
+        self, held: Held, pose: torch.Tensor, last: RgbdFrame | None, sources: int, slots: int,
+        recorded: Keyframes | None,
+    ) -> tuple[Glimpse, torch.Tensor | None]:  # fmt: skip
+        """`look`, and where that knows nothing, what the `last` frame (rgb, depth, pose) shows."""
         shared = Keyframes.none(self.size, pose.device) if recorded is None else recorded
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)
         picks = retrieve(shared, pose, self.camera, self.size, sources, own, rows)
-        return look(shared, picks, pose, self.camera, self.size, slots, own)
+        return look_and_carry(shared, picks, pose, self.camera, self.size, slots, own, last)
 
     def _arena_of(self, held: Held) -> Arena:
         return held.arenas.get(ROWS, self._arena) if isinstance(held, State) else self._arena

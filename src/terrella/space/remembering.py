@@ -18,7 +18,7 @@ from ..core.state import State
 from ..core.world import World
 from .camera import Intrinsics, planar_pose, rays, yaw
 from .estimator import Estimator
-from .keyframes import Glimpse, merge
+from .keyframes import Glimpse
 from .memory import ROWS, Memory
 from .reproject import least_around
 
@@ -173,7 +173,7 @@ def blend(glimpse: Glimpse, invented: torch.Tensor) -> tuple[torch.Tensor, torch
     inside = least_around(glimpse.known)[:, None]
     share = F.avg_pool2d(inside, 5, 1, 2, count_include_pad=False) * glimpse.known[:, None]
     share = share * (3 * glimpse.trust[:, :1]).clamp(0, 1)
-    recalled, guess = merge(glimpse), invented.float() / 255
+    recalled, guess = glimpse.merged, invented.float() / 255
     cell = max(min(invented.shape[-2:]) // 6, 1)
     near = F.avg_pool2d(share, cell, ceil_mode=True)
     off = F.avg_pool2d((recalled - guess) * share, cell, ceil_mode=True) / (near + 0.1)

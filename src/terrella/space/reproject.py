@@ -98,16 +98,38 @@ def warp(
     7]; turn [B, K, 3, 3] and target_turn [B, 3, 3]: the rotations of the poses, where they are at hand. Returns colour
     [B, K, 3, H', W'], agreement [B, K, H', W'] (1 where the keyframe saw the same surface, 0 where not) and closeness [B, K, H',
     W']: the distance in the target over that in the keyframe."""
-    batch, keys = rgb.shape[:2]
-    height, width = target_depth.shape[-2:]
-    points = unproject(target_depth, target_pose, camera, target_turn).flatten(1, 2)
+    turn = rotation(pose) if turn is None else turn
+    target_turn = rotation(target_pose) if target_turn is None else target_turn
+    places, agreement, near = sight(depth, pose, turn, target_depth, (target_pose, target_turn), camera)
+    return colours_at(rgb, places), agreement, target_depth[:, None] / near
+
+
+def sight(
+    depth: torch.Tensor,
+    pose: torch.Tensor,
+    turn: torch.Tensor,
+    target_depth: torch.Tensor,
+    target: tuple[torch.Tensor, torch.Tensor],
+    camera: Intrinsics,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Where K keyframes see what the pixels of a target view show: places [B, K, H', W', 2] in their pictures, in [-1, 1], and
+    agreement [B, K, H', W'], of arguments as in `warp`, with the target's pose and rotation; and how far ahead it lies of them."""
+    (batch, keys), (height, width) = depth.shape[:2], target_depth.shape[-2:]
+    points = unproject(target_depth, target[0], camera, target[1]).flatten(1, 2)
     grid, ahead = project(points[:, None].expand(-1, keys, -1, -1), pose, grid_intrinsics(camera), turn)
     grid, ahead = grid.view(batch * keys, height, width, 2), ahead.view(batch, keys, height, width)
-    colour = F.grid_sample(rgb.flatten(0, 1), grid, mode="bilinear", padding_mode="border", align_corners=False)
     held = F.grid_sample(depth.flatten(0, 1)[:, None], grid, mode="nearest", padding_mode="border", align_corners=False)
     inside = _inside(grid, ahead.flatten(0, 1)).view_as(ahead)
     agreement, near = _agreement(held.view_as(ahead), ahead, inside)
-    return colour.view(batch, keys, -1, height, width), agreement, target_depth[:, None] / near
+    return grid.view(batch, keys, height, width, 2), agreement, near
+
+
+def colours_at(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """The colours [B, K, 3, H', W'] of pictures [B, K, 3 (or any planes), H, W] at `places` [B, K, H', W', 2] in [-1, 1]."""
+    colour = F.grid_sample(
+        rgb.flatten(0, 1), places.flatten(0, 1), mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return colour.view(*places.shape[:2], -1, *places.shape[2:4])
 
 
 def _inside(grid: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
@@ -117,10 +139,8 @@ def _inside(grid: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
 
 def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture. And `ahead`, at least NEAR_M."""
-    near = ahead.clamp_min(NEAR_M)
-    error = (held - ahead).abs() / near
-    most = constant(torch.tensor, held.device, 1.5)
-    return torch.sub(most, error, alpha=1 / SAME).clamp(0, 1) * inside, near
+    near, most = ahead.clamp_min(NEAR_M), constant(torch.tensor, held.device, 1.5)
+    return torch.addcdiv(most, (held - ahead).abs(), near, value=-1 / SAME).clamp(0, 1) * inside, near
 
 
 def carry_unknown(
@@ -140,8 +160,13 @@ def carry_unknown(
 def carry_unknown_slowly(rgb, depth, pose, known, target_depth, target_pose, camera) -> torch.Tensor:
     """The same as `carry_unknown`, in plain tensor algebra, also for GPUs and gradients."""
     colour, agreement, _ = warp((rgb / 255)[:, None], depth[:, None], pose[:, None], target_depth, target_pose, camera)
+    return unknown_alone(colour[:, 0], agreement, known)
+
+
+def unknown_alone(colour: torch.Tensor, agreement: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    """Colour [B, 3, H, W] and trust, `agreement` [B, 1, H, W], where nothing is `known` [B, H, W], else 0: [B, 4, H, W]."""
     trust = agreement * (1 - known[:, None])
-    return torch.cat([colour[:, 0] * (trust > 0), trust], 1)
+    return torch.cat([colour * (trust > 0), trust], 1)
 
 
 def carry_things(

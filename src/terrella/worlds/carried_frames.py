@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import torch
 
+from ..core.backend import kernels_do
 from ..space.camera import Intrinsics
-from ..space.reproject import carry_things, least_around
+from ..space.reproject import carry_things, least_around, least_around_slowly
 
 PLANES = 6  # planes that `carry_frames` adds to the last frame's colour and trust
 
@@ -26,7 +27,8 @@ def covered_pixels(instances: torch.Tensor, things: torch.Tensor) -> torch.Tenso
     """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and the `things` [B, H, W] around them,
     since the pixels of their rim are mixed."""
     bare = (instances == 0).float()
-    return (bare == 0) | ((least_around(bare) == 0) & (things > 0.5))
+    around = least_around if kernels_do(bare) else least_around_slowly
+    return (bare == 0) | ((around(bare) == 0) & (things > 0.5))
 
 
 def static_depth(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..core.backend import kernels_do, plus
-from ..space.keyframes import Glimpse, merge
+from ..space.keyframes import Glimpse
 from .carried_frames import PLANES
 from .config import THUMBNAIL, GeneratorConfig
 
@@ -47,7 +47,7 @@ class Conditioning:
         return self._each(lambda part: part[rows])
 
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> Conditioning:
-        glimpse = Glimpse(*map(change, vars(self.glimpse).values()))
+        glimpse = self.glimpse.each(change)
         parts = {name: part for name, part in vars(self).items() if isinstance(part, torch.Tensor)}
         return replace(self, glimpse=glimpse, **{name: change(part) for name, part in parts.items()})
 
@@ -125,7 +125,7 @@ class UNet(nn.Module):
             noisy, time = torch.zeros_like(noisy), torch.zeros_like(time)
         before, after = self._shifts(torch.cat([time[:, None], conditioning.context], 1))
         colours, trust = plus(-1.0, glimpse.rgb, 2), glimpse.trust
-        merged = plus(-1.0, merge(glimpse), 2)
+        merged = plus(-1.0, glimpse.merged, 2)
         depth = encode_depth(glimpse.depth)[:, None]
         last_rgb, last_trust = plus(-1.0, last[:, :3], 2), last[:, 3:4]
         lasting = last_trust > 0
@@ -188,7 +188,7 @@ def encode_depth(depth: torch.Tensor) -> torch.Tensor:
 
 
 def decode_depth(code: torch.Tensor) -> torch.Tensor:
-    return ((code + 0.6) * 2).exp().clamp(NEAR_DEPTH_M, FAR_DEPTH_M)
+    return plus(1.2, code, 2).exp().clamp(NEAR_DEPTH_M, FAR_DEPTH_M)
 
 
 def context_thumbnail(rgb: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ from ..space.keyframes import Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
-from ..space.reproject import carry_unknown, fill_holes
+from ..space.reproject import fill_holes
 from .carried_frames import Frame, carry_frames, covered_pixels, static_depth
 from .config import KeyframesConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
@@ -214,16 +214,14 @@ class KeyframeScene:
     def look(self, state: State, before: State) -> Conditioning:
         """What is known of the view from the state's pose; `before` has the last frame."""
         config, pose = self.config, state["pose"]
-        glimpse = self.own.look(state, pose, config.sources, config.slots, self.recorded)
+        last = None if config.moving else (before["rgb"], before["depth"], before["pose"])
+        glimpse, carried = self.own.look_and_carry(state, pose, last, config.sources, config.slots, self.recorded)
         context, familiar = context_thumbnail(before["rgb"]), self._familiar(state)
-        if not config.moving:
-            frame = before["rgb"], before["depth"], before["pose"]
-            last = carry_unknown(*frame, glimpse.known, glimpse.depth, pose, config.camera)
-            return Conditioning(glimpse, last, context, familiar)
-        frames = []
-        for age in ("", "earlier_"):
-            rgb, depth, things, at, instances = (before[f"{age}{part}"] for part in SEEN)
-            frames.append(Frame(rgb, depth, things, at, covered_pixels(instances, things)))
+        if carried is not None:
+            return Conditioning(glimpse, carried, context, familiar)
+        last, earlier = ([before[f"{age}{part}"] for part in SEEN] for age in ("", "earlier_"))
+        covered = covered_pixels(torch.cat([last[4], earlier[4]]), torch.cat([last[2], earlier[2]])).chunk(2)
+        frames = Frame._make([*last[:4], covered[0]]), Frame._make([*earlier[:4], covered[1]])
         context = torch.cat([context, state["actions"].flatten(1)], 1)
         return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context, familiar)
 

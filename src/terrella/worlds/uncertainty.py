@@ -18,7 +18,6 @@ from torch import nn
 from ..core.backend import constant, plus
 from ..core.state import State
 from ..space.camera import yaw
-from ..space.keyframes import merge
 from .generator import Conditioning
 from .parts import Absent, Channels
 
@@ -177,7 +176,7 @@ def situation_of(gone: torch.Tensor, conditioning: Conditioning) -> torch.Tensor
 def input_maps(conditioning: Conditioning, clean: torch.Tensor) -> torch.Tensor:
     """Maps [B, INPUT_MAPS, H / CELLS, W / CELLS] of a drawn frame and its sources."""
     glimpse, last = conditioning.glimpse, conditioning.last
-    drawn, merged = clean[:, :3].clamp(-1, 1), plus(-1.0, merge(glimpse), 2)
+    drawn, merged = clean[:, :3].clamp(-1, 1), plus(-1.0, glimpse.merged, 2)
     trust = glimpse.trust[:, :2] if glimpse.trust.shape[1] > 1 else glimpse.trust.repeat(1, 2, 1, 1)
     second = glimpse.rgb[:, min(1, glimpse.rgb.shape[1] - 1)]
     apart = _sizes(glimpse.rgb[:, 0] - second) * (trust[:, 1:] > 0)
