@@ -21,6 +21,7 @@ LEAST_PICTURE_SIDE = 16  # pixels: smaller arrays [H, W, C] are codes of cells, 
 CODES = 32  # values of a code
 CELLS = 4  # side of the pooled feature map of a picture
 QUERIES = 4  # places of a picture to which an instruction attends
+SHARPNESS = 20.0  # of attention: factor on the cosines of queries and places; plain products never learned to tell colours apart
 FLOW_STEPS = 8  # Euler steps from noise to a chunk
 
 
@@ -36,6 +37,9 @@ class ImitationConfig:
     chunk: int = 1  # actions that it predicts at once
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
+    waypoint: int = (
+        0  # steps after an instruction began of which it predicts its numbers from where that attends to; 0: not
+    )
     differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
@@ -83,7 +87,8 @@ def is_picture(shape: tuple[int, ...]) -> bool:
 
 class _Look(nn.Module):
     """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018). Of
-    a picture also where each map is largest, and where the instruction's queries attend to."""
+    a picture also where each map is largest, and in columns of their own [N, 2 * QUERIES] where the instruction's queries attend
+    to, by cosines."""
 
     offset: torch.Tensor
 
@@ -103,8 +108,10 @@ class _Look(nn.Module):
             last, cells = 32, shape[0] * shape[1]
         self.film = nn.Linear(words, 2 * last) if words else None
         self.second = nn.Conv2d(last, last, 3, 1, 1)
-        self.queries = nn.Linear(words, QUERIES * last) if words and self.picture else None
-        self.out = nn.Linear(last * cells + 2 * QUERIES * (self.queries is not None), width)
+        attends = words and self.picture
+        self.keys = nn.Conv2d(last, last, 1) if attends else None
+        self.queries = nn.Linear(words, QUERIES * last) if attends else None
+        self.out = nn.Linear(last * cells, width)
 
     def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
         if self.picture:
@@ -113,18 +120,20 @@ class _Look(nn.Module):
         else:
             codes = seen.long().clamp(0, CODES - 1) + self.offset
             features = self.first(self.codes(codes).sum(3).permute(0, 3, 1, 2))
+        plain = features
         if self.film is not None and words is not None:
             scale, shift = self.film(words)[..., None, None].chunk(2, 1)
             features = torch.relu((1 + scale) * features + shift)
-        maps = self.second(features)
-        features = torch.relu(maps)
+        features = torch.relu(self.second(features))
         if not self.picture:
             return torch.relu(self.out(features.flatten(1)))
-        parts = [F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)]
-        if self.queries is not None and words is not None:
-            queries = self.queries(words).unflatten(1, (QUERIES, -1))
-            parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, maps)))
-        return torch.relu(self.out(torch.cat(parts, 1)))
+        pooled = torch.cat([F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)], 1)
+        parts = [torch.relu(self.out(pooled))]
+        if self.keys is not None and self.queries is not None and words is not None:
+            queries = SHARPNESS * F.normalize(self.queries(words).unflatten(1, (QUERIES, -1)), dim=2)
+            keys = F.normalize(self.keys(plain), dim=1)
+            parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, keys)))
+        return torch.cat(parts, 1)
 
 
 def spatial_softmax(features: torch.Tensor) -> torch.Tensor:
@@ -162,11 +171,18 @@ class ImitationNetwork(nn.Module):
             self.register_buffer("change", torch.ones(width))
             changes = (config.window - 1) * width
         self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
-        self.width = width + actor.hidden * len(self.looks)
+        self.attended = 2 * QUERIES * sum(look.picture for look in self.looks) if words else 0
+        self.width = width + actor.hidden * len(self.looks) + self.attended
+        self.waypoint = self.offset = None
+        if foresees := config.waypoint > 0 and width > 0 and self.attended > 0:
+            self.waypoint = nn.Sequential(
+                nn.Linear(self.attended, actor.hidden), nn.ReLU(), nn.Linear(actor.hidden, width)
+            )
+            self.offset = nn.Linear(words, width)
         self.memory = nn.GRU(self.width, actor.hidden, batch_first=True) if config.remember else None
         acted = config.window * config.action_width if config.own_actions else 0
         seen = config.window * self.width + (actor.hidden if self.memory else 0) + changes
-        into = seen + acted + words + (config.outcome is not None)
+        into = seen + acted + words + (config.outcome is not None) + (width if foresees else 0)
         flow = actor.mode == AXES
         chunk = config.chunk * (config.action_width if flow else actor.outputs)
         self.trunk = mlp(into, actor.hidden, actor.layers, actor.hidden if flow else chunk, gain=1.0 if flow else 0.1)
@@ -176,11 +192,21 @@ class ImitationNetwork(nn.Module):
         """[N, width] of observations of N steps; words: the instruction as features [N, words]."""
         device, parts = self.mean.device, []
         if self._vectors:
-            parts.append(self._numbers(seen))
-        parts += [look(seen[name].to(device), words) for look, (name, _) in zip(self.looks, self._arrays)]
-        return torch.cat(parts, 1)
+            parts.append(self.numbers(seen))
+        looks = [look(seen[name].to(device), words) for look, (name, _) in zip(self.looks, self._arrays)]
+        hidden = self.config.actor.hidden
+        return torch.cat([*parts, *(look[:, :hidden] for look in looks), *(look[:, hidden:] for look in looks)], 1)
 
-    def _numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def foreseen(self, history: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor | None:
+        """The numbers [N, D], normalised, that it expects `waypoint` steps after an instruction began, from features
+        [N, window, width]; None where it predicts none. Of the pictures it knows nothing but the places to which the instruction
+        attends, so these must be of what is named; the words alone only shift them."""
+        if self.waypoint is None or self.offset is None or words is None:
+            return None
+        return self.waypoint(history[:, -1, self.width - self.attended : self.width]) + self.offset(words)
+
+    def numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """The channels of numbers [N, ...], normalised: [N, D]."""
         device = self.mean.device
         flat = torch.cat([seen[name].to(device).float().reshape(-1, count) for name, count in self._vectors], 1)
         return symlog((flat - self.mean) / self.scale).clamp(-MAX_SYMLOG, MAX_SYMLOG)
@@ -205,7 +231,7 @@ class ImitationNetwork(nn.Module):
             self.mean.copy_(flat.mean(0))
             self.scale.copy_(_deviation(flat))
             if self.config.differences:
-                changes = self._numbers(seen).view(-1, self.config.window, len(self.mean)).diff(dim=1)
+                changes = self.numbers(seen).view(-1, self.config.window, len(self.mean)).diff(dim=1)
                 self.change.copy_(_deviation(changes.flatten(0, 1)))
 
     def forward(
@@ -218,6 +244,7 @@ class ImitationNetwork(nn.Module):
             parts.append((history[..., : len(self.mean)].diff(dim=1) / self.change).flatten(1))
         parts += [acted.flatten(1)] if self.config.own_actions else []
         parts += [words] if words is not None else []
+        parts += [] if (foreseen := self.foreseen(history, words)) is None else [foreseen]
         parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []
         return self.trunk(torch.cat(parts, 1))
 

@@ -15,6 +15,7 @@ from ..data.training.cache import array_for
 from .objectives.imitation import Demonstrations
 from .recording import Recording
 
+BEGINNINGS = 0.25  # part of a batch at which an instruction begins
 CONFIDENCE = "observation.action_confidence"  # of actions that a model named (train inverse)
 
 
@@ -94,8 +95,15 @@ class DemonstrationRows:
         return replace(self, rows=np.flatnonzero(inside & self.valid))
 
     def sample(self, count: int, rng: np.random.Generator) -> Demonstrations:
-        """`count` moments, drawn uniformly."""
-        return self.at(rng.choice(self.rows, count))
+        """`count` moments, drawn uniformly; with waypoints a part of them at the beginning of instructions."""
+        rows = rng.choice(self.rows, count)
+        if self.config.waypoint and len(first := self.rows[self._begins(self.rows)]):
+            rows[: int(BEGINNINGS * count)] = rng.choice(first, int(BEGINNINGS * count))
+        return self.at(rows)
+
+    def _begins(self, rows: np.ndarray) -> np.ndarray:
+        """bool [N]: whether an instruction begins at these rows."""
+        return self._instructed(rows)[0] == rows
 
     def at(self, rows: np.ndarray) -> Demonstrations:
         """The moments `rows`. Before an episode's first row the history repeats it, with actions of zero. For a policy that
@@ -130,10 +138,12 @@ class DemonstrationRows:
         after = np.searchsorted(changes, rows, side="right")
         return np.maximum(start, changes[after - 1]), np.minimum(stop, changes[after])
 
-    def observations(self, rows: np.ndarray) -> dict[str, torch.Tensor]:
+    def observations(self, rows: np.ndarray, numbers_only: bool = False) -> dict[str, torch.Tensor]:
         """What the policy sees at `rows`: channel -> [N, ...]."""
         cache, seen = self.recording.cache, {}
-        for name, _ in self.config.actor.sees:
+        for name, shape in self.config.actor.sees:
+            if numbers_only and len(shape) > 1:
+                continue
             array = array_for(name, cache.arrays, cache.keys)
             assert array is not None
             seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][rows])).to(self.device)
@@ -152,10 +162,14 @@ class DemonstrationRows:
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk = self.actions[torch.from_numpy(ahead)]
+        later = np.minimum(rows + config.waypoint, self.stop[rows] - 1)
+        waypoint = self.observations(later, numbers_only=True) if config.waypoint else None
+        begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None
         words, outcome = (
             None if each is None else each[torch.from_numpy(of)].to(self.device)
             for each, of in ((self.words, spoken), (self.outcome, rows))
         )  # fmt: skip
         return Demonstrations(
-            seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome
-        )
+            seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome,
+            waypoint=waypoint, begins=begins,
+        )  # fmt: skip

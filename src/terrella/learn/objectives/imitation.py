@@ -18,7 +18,7 @@ FORGOTTEN = (
 )
 FULL = nullcontext()
 DRAWS = 8  # of noise and flow time for each moment: a look at pictures costs far more than the flow
-SHIFT = 2  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et al. 2020)
+SHIFT = 1  # pixels by which pictures are moved at most, as in DrQ (Kostrikov et al. 2020)
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,10 @@ class Demonstrations:
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
     windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
     requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
+    waypoint: Mapping[str, torch.Tensor] | None = (
+        None  # numbers [N, ...] some steps later, at most at the episode's end
+    )
+    begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
 
 
 class BehaviourCloning:
@@ -47,7 +51,8 @@ class BehaviourCloning:
         network, config, count = self.network, self.network.config, len(batch.chunk)
         hidden = torch.from_numpy(now.rng.random(count) < FORGOTTEN).to(batch.acted.device)
         half = now.half() if any(look.picture for look in network.looks) else FULL
-        out = condition(network, batch, torch.where(hidden[:, None, None], 0.0, batch.acted), _shift(now), half)
+        history, words = moments(network, batch, _shift(now), half)
+        out = network(history, torch.where(hidden[:, None, None], 0.0, batch.acted), words, batch.outcome)
         if config.actor.mode == AXES:
             data, out = batch.chunk.flatten(1).repeat(DRAWS, 1), out.repeat(DRAWS, 1)
             time, noise = now.rand(len(data)), now.randn(*data.shape)
@@ -57,29 +62,46 @@ class BehaviourCloning:
         else:
             error = chunk_errors(network, out, batch.chunk)
         loss = (error * batch.weight).sum() / batch.weight.sum().clamp_min(1e-6)
-        yield Loss(self.name, loss, {self.name: loss})
+        facts, foreseen = {self.name: loss}, network.foreseen(history, words)
+        if foreseen is not None and batch.waypoint is not None:
+            facts["waypoint"] = waypoint_error(network, foreseen, batch)
+        yield Loss(self.name, sum(facts.values(), loss * 0), facts)
 
 
-def condition(
+def waypoint_error(network: ImitationNetwork, foreseen: torch.Tensor, batch: Demonstrations) -> torch.Tensor:
+    """The squared error of waypoints [N, D], normalised, at moments at which an instruction begins: later the place of the hand
+    alone tells where it goes."""
+    assert batch.waypoint is not None and batch.begins is not None
+    errors = (foreseen - network.numbers(batch.waypoint)).square().mean(1)
+    return (errors * batch.begins).sum() / batch.begins.sum().clamp_min(1)
+
+
+def condition(network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor) -> torch.Tensor:
+    """What the network makes of moments: logits, or the condition of the flow."""
+    history, words = moments(network, batch)
+    return network(history, acted, words, batch.outcome)
+
+
+def moments(
     network: ImitationNetwork,
     batch: Demonstrations,
-    acted: torch.Tensor,
     shift: tuple[int, int] = (0, 0),
     half: AbstractContextManager[object] = FULL,
-) -> torch.Tensor:
-    """What the network makes of moments: logits, or the condition of the flow. half: in which it looks at pictures."""
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """The features [N, window, width] of moments, with what is remembered, and those of their instructions [N, words]. half: in
+    which it looks at pictures."""
     count, history = len(batch.chunk), network.config.history
     words = None if network.words is None or batch.words is None else network.words(batch.words)
     seen = {name: _moved(value, shift) for name, value in batch.seen.items()} if any(shift) else batch.seen
     if batch.windows is None:
         with half:
             features = network.features(seen, None if words is None else words.repeat_interleave(history, 0)).float()
-        return network(features.view(count, history, -1), acted, words, batch.outcome)
+        return features.view(count, history, -1), words
     with half:
         features = window_features(network, seen, words, batch.windows).float()
     recalled = network.recall(features, None)[0].flatten(0, 1)[:, None]
     every = None if words is None else words.repeat_interleave(batch.windows.shape[1], 0)
-    return network(recalled, acted, every, batch.outcome)
+    return recalled, every
 
 
 def window_features(

@@ -63,6 +63,9 @@ class Imitation:
     remember: int = 0
     """Carry a memory through the episode (a GRU) instead of seeing the last observations; it learns on windows of this many steps.
     Default: 0, none."""
+    waypoint: int = 8
+    """A policy of cameras, numbers and instructions predicts what its numbers (the place of its hand) will be this many steps
+    after an instruction began, only from the places to which the instruction attends. 0: not."""
     outcome: bool = False
     """Condition the policy on the return of the episode and ask for the best: failures teach what not to do."""
 
@@ -154,7 +157,8 @@ def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: 
     tasks = opened.cache.tasks if len(set(opened.cache.tasks)) > 1 else ()
     return ImitationConfig(
         actor, imitation.picture_size, vocabulary_of(tasks), imitation.history, imitation.own_actions, chunk, execute,
-        best_outcome(opened) if imitation.outcome else None, remember=imitation.remember,
+        best_outcome(opened) if imitation.outcome else None, 0 if imitation.remember else imitation.waypoint,
+        remember=imitation.remember,
     )  # fmt: skip
 
 
@@ -176,10 +180,10 @@ def _shape(opened: Recording, name: str) -> tuple[int, ...] | None:
 
 def _check(practice: Practice, imitation: Imitation) -> None:
     counts = (imitation.history, imitation.chunk or 1, imitation.execute or 1, practice.hidden, practice.batch or 1)
-    if min(*counts, imitation.remember + 1, practice.steps or 1) < 1 or not (
+    if min(*counts, imitation.remember + 1, imitation.waypoint + 1, practice.steps or 1) < 1 or not (
         practice.minutes is None or practice.minutes > 0
     ):
         raise TrainingError(
-            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember is 0 or more, and --minutes is "
-            "above 0."
+            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember and --waypoint are 0 or more, and "
+            "--minutes is above 0."
         )

@@ -82,7 +82,7 @@ def train_inverse(
     run.saved_facts(STAGE)
     torch.manual_seed(config.seed)
     network_config = config_of(opened, sees, config.hidden, Imitation(config.picture_size, history=history, chunk=1))
-    network = ImitationNetwork(replace(network_config, vocabulary=(), differences=True)).to(run.device)
+    network = ImitationNetwork(replace(network_config, vocabulary=(), waypoint=0, differences=True)).to(run.device)
     rows = replace(DemonstrationRows.of(opened, network.config, run.device), ahead=config.after)
     back = max(1, round(KEPT_BACK * len(labelled)))
     order = np.random.default_rng(config.seed).permutation(labelled)

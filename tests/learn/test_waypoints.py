@@ -1,0 +1,76 @@
+"""A policy of pictures and instructions predicts where its numbers go, from the places to which the instruction attends."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from tests.learn.test_imitation_of_a_teacher import rows_of
+
+from terrella.act.actor_network import ActorConfig
+from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
+from terrella.core.policy import Random
+from terrella.core.world import make_rng
+from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations, moments
+from terrella.learn.train_step import TrainStep
+
+COLOURS = {"blue": (30, 60, 220), "green": (30, 150, 50), "red": (220, 30, 30)}
+
+
+def scenes(count, rng):
+    """Pictures of three squares, the number of the one that is named, and its place [count, 2] from -1 to 1."""
+    corners = np.stack([rng.permutation(16)[:3] for _ in range(count)])
+    corners = np.stack([corners // 4, corners % 4], 2) * 6 + rng.integers(0, 3, (count, 3, 2))
+    pictures = np.full((count, 24, 24, 3), 120, np.uint8)
+    for picture, three in zip(pictures, corners):
+        for colour, (y, x) in zip(COLOURS.values(), three):
+            picture[y : y + 3, x : x + 3] = colour
+    named = rng.integers(0, 3, count)
+    return torch.from_numpy(pictures), named, torch.from_numpy(corners[np.arange(count), named] / 11.5 - 0.9).float()
+
+
+def test_a_waypoint_is_at_the_thing_that_is_named_in_scenes_it_never_saw():
+    torch.manual_seed(0)
+    actor = ActorConfig((("rgb", (24, 24, 3)), ("hand", (2,))), "axes", (1,), (-1.0,), (1.0,), hidden=32)
+    network = ImitationNetwork(ImitationConfig(actor, (24, 24), tuple(COLOURS), history=1, waypoint=8))
+    objective, rng, count = BehaviourCloning(network, 5e-3), np.random.default_rng(0), 48
+    optimiser = objective.learners["imitation"].optimiser
+    optimiser.param_groups[0]["lr"] = 5e-3
+    words = network.words.read(list(COLOURS))
+
+    def batch():
+        pictures, named, place = scenes(count, rng)
+        seen = {"rgb": pictures, "hand": torch.zeros(count, 2)}
+        still = torch.zeros(count, 1, 1)
+        begins = torch.ones(count)
+        weight = torch.ones(count, 1)
+        return Demonstrations(seen, still, still, weight, words[named], waypoint={"hand": place}, begins=begins)
+
+    for step in range(80):
+        loss = next(iter(objective.losses(batch(), TrainStep(step, 0.0, torch.device("cpu"), rng, make_rng(step)))))
+        optimiser.zero_grad()
+        loss.value.backward()
+        optimiser.step()
+    test = batch()
+    with torch.no_grad():
+        error = network.eval().foreseen(*moments(network, test)) - network.numbers(test.waypoint)
+    assert set(loss.parts) == {"imitation", "waypoint"}
+    assert error.abs().amax(1).lt(0.25).float().mean() > 0.9  # by chance one in ten
+
+
+def test_waypoints_are_learned_where_an_episode_begins(tmp_path):
+    rows, opened = rows_of(Random, tmp_path / "random")
+    rows = replace(rows, config=replace(rows.config, waypoint=3))
+    place = torch.from_numpy(np.array(opened.cache.arrays["observation.place"], np.float32)).reshape(-1, 1)
+    first, stop = opened.cache.episodes[1]
+    batch = rows.at(np.array([first, first + 1, stop - 2]))
+    assert batch.begins.tolist() == [1, 0, 0]
+    assert torch.equal(batch.waypoint["place"].reshape(-1, 1), place[[first + 3, first + 4, stop - 1]])
+    drawn = rows.sample(400, np.random.default_rng(0))
+    assert 0.25 <= drawn.begins.mean() < 0.45  # a quarter, and what is drawn by chance
+
+
+def test_a_policy_without_pictures_or_instructions_has_no_waypoints():
+    numbers = ActorConfig((("hand", (2,)),), "axes", (1,), (-1.0,), (1.0,), hidden=8)
+    pictures = replace(numbers, sees=(("rgb", (24, 24, 3)), ("hand", (2,))))
+    for actor, words in ((numbers, ("red",)), (pictures, ())):
+        assert ImitationNetwork(ImitationConfig(actor, (24, 24), words, history=1, waypoint=8)).waypoint is None
