@@ -51,8 +51,11 @@ def test_a_waypoint_is_at_the_thing_that_is_named_in_scenes_it_never_saw():
         loss.value.backward()
         optimiser.step()
     test = batch()
+    assert test.waypoint is not None
     with torch.no_grad():
-        error = network.eval().foreseen(*moments(network, test)) - network.numbers(test.waypoint)
+        foreseen = network.eval().foreseen(*moments(network, test))
+        assert foreseen is not None
+        error = foreseen - network.numbers(test.waypoint)
     assert set(loss.parts) == {"imitation", "waypoint"}
     assert error.abs().amax(1).lt(0.25).float().mean() > 0.9  # by chance one in ten
 

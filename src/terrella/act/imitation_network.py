@@ -171,7 +171,7 @@ class ImitationNetwork(nn.Module):
             self.register_buffer("change", torch.ones(width))
             changes = (config.window - 1) * width
         self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
-        self.attended = 2 * QUERIES * sum(look.picture for look in self.looks) if words else 0
+        self.attended = 2 * QUERIES * sum(is_picture(shape) for _, shape in self._arrays) if words else 0
         self.width = width + actor.hidden * len(self.looks) + self.attended
         self.waypoint = self.offset = None
         if foresees := config.waypoint > 0 and width > 0 and self.attended > 0:

@@ -184,6 +184,6 @@ def _check(practice: Practice, imitation: Imitation) -> None:
         practice.minutes is None or practice.minutes > 0
     ):
         raise TrainingError(
-            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember and --waypoint are 0 or more, and "
-            "--minutes is above 0."
+            "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember and --waypoint are 0 or more, "
+            "and --minutes is above 0."
         )
