@@ -14,7 +14,7 @@ import torch
 from ...act.actor import RUN_SUBFOLDER
 from ...act.actor_network import ActorConfig
 from ...act.imitation import ImitationActor
-from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork
+from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork, is_picture
 from ...act.sentences import vocabulary_of
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import Spec, kind_of
@@ -155,9 +155,11 @@ def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: 
     if execute > chunk:
         raise TrainingError(f"--execute {execute}: at most the {chunk} actions of --chunk can be taken.")
     tasks = opened.cache.tasks if len(set(opened.cache.tasks)) > 1 else ()
+    pictures, numbers = (any(kind(shape) for _, shape in seen) for kind in (is_picture, lambda shape: len(shape) < 2))
+    foresees = pictures and numbers and tasks and not imitation.remember
     return ImitationConfig(
         actor, imitation.picture_size, vocabulary_of(tasks), imitation.history, imitation.own_actions, chunk, execute,
-        best_outcome(opened) if imitation.outcome else None, 0 if imitation.remember else imitation.waypoint,
+        best_outcome(opened) if imitation.outcome else None, imitation.waypoint if foresees else 0,
         remember=imitation.remember,
     )  # fmt: skip
 
