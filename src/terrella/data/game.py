@@ -33,7 +33,9 @@ def check_game(dataset: Dataset, spec: Spec) -> str:
     elif "rgb" in spec.observes and not dataset.has("rgb"):
         why = f"holds no pictures, which {spec.name} observes"
     if why:
-        raise DatasetError(f"{dataset.root} {why}: score and train a world on recordings of its own game.")
+        raise DatasetError(
+            f"{dataset.root} {why}: give recordings of its own game and actions, or train a new world on this one (terrella train)."
+        )
     rate = 1 / spec.dt_s
     if abs(dataset.fps - rate) > 0.02 * rate:
         return f"{dataset.root} has {dataset.fps:.3g} steps a second; {spec.name} learned {rate:.3g}."

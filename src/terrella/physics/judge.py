@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,6 @@ from ..core.errors import ChannelError
 from ..space.views import arrays, over_views
 from .gaps import rotated
 from .kernels_numba import columns
-from .kernels_numba.bodies import Solid
 from .kernels_numba.guard import guard_rows
 from .laws import LAWS
 from .laws.free_fall import rods_alone
@@ -56,7 +55,7 @@ class Judge:
         self._limits = np.zeros(len(ORDER))
         for one in self.tolerances:
             self._limits[ORDER.index(one.law.name)] = one.value
-        self._solid = solid_of(system, dt_s, self.widths)
+        self._matrix = matrix_of(system, dt_s, self.widths)
 
     def __call__(self, held: Tensor, seen: Tensor, fresh: Tensor, allowed: Tensor) -> Judged:
         if not self._compiled or not kernels_do(seen):
@@ -67,7 +66,7 @@ class Judge:
         parts = arrays(held, own, fresh, allowed, ratios, way, changed)
 
         def work(first: int, last: int) -> None:
-            guard_rows(self._solid, self._limits, ROUNDS, *parts, first, last)  # pyright: ignore[reportCallIssue]
+            guard_rows(self._matrix, self._limits, ROUNDS, *parts, first, last)  # pyright: ignore[reportCallIssue]
 
         over_views(batch, work)
         before, left = ratios.index_select(2, self._laws).unbind(1)
@@ -78,8 +77,9 @@ class Judge:
         return dict(zip(self.widths, flat.split(list(self.widths.values()), -1)))
 
 
-def solid_of(system: PhysicalSystem, dt_s: float, widths: Mapping[str, int]) -> Solid:
-    """The system as the kernels read it. ChannelError where a channel is too short."""
+def matrix_of(system: PhysicalSystem, dt_s: float, widths: Mapping[str, int]) -> np.ndarray:
+    """The system as the kernels read it, float64 [1 + bodies + walls + rods + limits, columns]. ChannelError where a channel is
+    too short."""
     first = dict(zip(widths, np.cumsum([0, *widths.values()]).tolist()))
 
     def at(slot: Slot | None, count: int) -> int:
@@ -130,14 +130,12 @@ def solid_of(system: PhysicalSystem, dt_s: float, widths: Mapping[str, int]) -> 
         *high,
     ]
     axes = [[*part, *[-1] * (3 - len(part))] for part in (system.axes, system.spin_axes)]
-    return Solid(
-        np.array([body_row(body) for body in system.bodies]),
-        np.array(walls, dtype=np.float64).reshape(len(walls), columns.WALL),
-        np.array(rods, dtype=np.float64).reshape(len(rods), 6),
-        np.array(limits, dtype=np.float64).reshape(len(limits), 3),
-        np.array([*facts, SKIN, REACH], dtype=np.float64),
-        np.array(axes, dtype=np.int64),
-    )
+    facts += [SKIN, REACH, *axes[0], *axes[1], len(system.bodies), len(walls), len(rods), len(limits)]
+    rows = [facts, *(body_row(body) for body in system.bodies), *walls, *rods, *limits]
+    matrix = np.zeros((len(rows), columns.SYSTEM))
+    for row, values in zip(matrix, rows):
+        row[: len(values)] = values
+    return matrix
 
 
 # -- the same by the laws themselves ----------------------------------------------------------------------------------
@@ -155,6 +153,8 @@ def judge_slowly(judge: Judge, held: Tensor, seen: Tensor, fresh: Tensor, allowe
             break
         part, wrong = motion.at(rows), left[rows] > 1
         for one, broken in zip(judge.tolerances, wrong.T):
+            if broken.any():  # an earlier projection may have mended it
+                broken = broken & (_ratio(one, part, fresh[rows]) > 1)
             if broken.any():
                 part = _mixed(part, one.law.correct(part), broken)
         motion = motion.put(rows, part)
@@ -167,18 +167,15 @@ def judge_slowly(judge: Judge, held: Tensor, seen: Tensor, fresh: Tensor, allowe
 
 def _ratios(judge: Judge, motion: Trajectory, fresh: Tensor) -> Tensor:
     """The violation of the last step by each law [B, L], in tolerances."""
-    if not judge.tolerances:
-        return motion.position.new_zeros(motion.batch, 0)
-    return torch.stack(list(_each_ratio(judge, motion, fresh)), 1)
+    none = [motion.position.new_zeros(motion.batch, 0)]
+    return torch.cat([*none, *(_ratio(one, motion, fresh)[:, None] for one in judge.tolerances)], 1)
 
 
-def _each_ratio(judge: Judge, motion: Trajectory, fresh: Tensor) -> Iterator[Tensor]:
-    last = motion.between(1, 3) if fresh.any() else None
-    for one in judge.tolerances:
-        whole = one.law.residual(motion)[-1]
-        if last is not None:
-            whole = torch.where(fresh, one.law.residual(last)[-1], whole)
-        yield (whole / one.value).nan_to_num(nan=torch.inf)
+def _ratio(one: Tolerance, motion: Trajectory, fresh: Tensor) -> Tensor:
+    whole = one.law.residual(motion)[-1]
+    if fresh.any():
+        whole = torch.where(fresh, one.law.residual(motion.between(1, 3))[-1], whole)
+    return (whole / one.value).nan_to_num(nan=torch.inf)
 
 
 def _way(motion: Trajectory) -> Tensor:

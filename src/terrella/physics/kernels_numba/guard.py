@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from . import columns as c
-from .bodies import RolloutRow, compiled, contacts, load, measure, norm, plus, vector
+from .bodies import at, compiled, contacts, count_of, flat_at, load, measure, norm, others, plus, vector
 from .motion_laws import fall, free_fall, keep_bodies, keep_momentum, keep_support, momentum, permanence, support
 from .state_laws import continuity, energy, keep_continuity, keep_energy, keep_limits, limits, non_penetration, push_out
 
@@ -13,112 +13,115 @@ LAWS = 8  # in the order in which a guard corrects them
 
 
 @compiled
-def violation(law, s, row, fresh):
+def violation(law, s, r, fresh):
     if law == 0:
-        return permanence(s, row, fresh)
+        return permanence(s, r, fresh)
     if law == 1:
-        return free_fall(s, row, fresh)
+        return free_fall(s, r, fresh)
     if law == 2:
-        return momentum(s, row, fresh)
+        return momentum(s, r, fresh)
     if law == 3:
-        return support(s, row, fresh)
+        return support(s, r, fresh)
     if law == 4:
-        return limits(s, row, fresh)
+        return limits(s, r, fresh)
     if law == 5:
-        return energy(s, row, fresh)
+        return energy(s, r, fresh)
     if law == 6:
-        return continuity(s, row, fresh)
-    return non_penetration(s, row, fresh)
+        return continuity(s, r, fresh)
+    return non_penetration(s, r, fresh)
 
 
 @compiled
-def project(law, s, row):
+def project(law, s, r):
     if law == 0:
-        keep_bodies(s, row)
+        keep_bodies(s, r)
     elif law == 1:
-        fall(s, row)
+        fall(s, r)
     elif law == 2:
-        keep_momentum(s, row)
+        keep_momentum(s, r)
     elif law == 3:
-        keep_support(s, row)
+        keep_support(s, r)
     elif law == 4:
-        keep_limits(s, row)
+        keep_limits(s, r)
     elif law == 5:
-        keep_energy(s, row)
+        keep_energy(s, r)
     elif law == 6:
-        keep_continuity(s, row)
+        keep_continuity(s, r)
     else:
-        push_out(s, row)
-    measure(s, row, 2)
-    contacts(s, row, 1)
+        push_out(s, r)
+    measure(s, r, 2)
+    contacts(s, r, 1)
 
 
 @compiled
-def judge(s, row, tolerance, fresh, ratios):
+def ratio_of(law, s, r, tolerance, fresh):
+    ratio = violation(law, s, r, fresh) / tolerance[law] if tolerance[law] > 0 else 0.0
+    return ratio if ratio == ratio else math.inf
+
+
+@compiled
+def judge(s, r, tolerance, fresh, ratios):
     """Writes the violations in tolerances; whether one is above 1."""
     worst = 0.0
     for law in range(LAWS):
-        if tolerance[law] > 0:
-            ratio = violation(law, s, row, fresh) / tolerance[law]
-            ratios[law] = ratio if ratio == ratio else math.inf
-            worst = max(worst, ratios[law])
+        ratios[law] = ratio_of(law, s, r, tolerance, fresh)
+        worst = max(worst, ratios[law])
     return worst > 1
 
 
 @compiled
-def way_of(s, row):
+def way_of(s, r):
     """The way of all bodies in the last step, m; a jump counts as far as the larger speed reaches."""
     total = 0.0
-    for n in range(len(s.body)):
-        one, other = row.at[1, n], row.at[2, n]
-        reach = max(norm(vector(one, c.V)), norm(vector(other, c.V))) * s.facts[c.DT]
-        total += min(norm(plus(vector(other, c.P), vector(one, c.P), -1.0)), reach)
+    for n in range(count_of(s)):
+        one, other = at(s, 1, n), at(s, 2, n)
+        reach = max(norm(vector(r, one, c.V)), norm(vector(r, other, c.V))) * s[0, c.DT]
+        total += min(norm(plus(vector(r, other, c.P), vector(r, one, c.P), -1.0)), reach)
     return total
 
 
 @compiled
-def write(s, row, before, flat):
-    """The channels with the corrected bodies in them; whether anything changed. before [N, columns]: the bodies as predicted."""
-    changed = False
-    for k in range(len(flat)):
-        changed |= flat[k] != row.flat[2, k]
-        flat[k] = row.flat[2, k]
-    for n in range(len(s.body)):
+def write(s, r, seen, b):
+    """The channels with the corrected bodies in them; whether anything changed."""
+    changed, flat = False, flat_at(s, 2)
+    for k in range(seen.shape[1]):
+        changed |= seen[b, k] != r[flat, k]
+    for n in range(count_of(s)):
         for k in range(c.P, c.RADIUS):
-            changed |= before[n, k] != row.at[2, n, k]
+            changed |= r[at(s, 3, n), k] != r[at(s, 2, n), k]
     if not changed:
         return False
-    for n in range(len(s.body)):
-        body, one = s.body[n], row.at[2, n]
+    for n in range(count_of(s)):
+        body, one = 1 + n, at(s, 2, n)
         for j in range(3):
-            axis, spin = s.axes[0, j], s.axes[1, j]
+            axis, spin = int(s[0, c.AXES + j]), int(s[0, c.SPIN_AXES + j])
             if axis >= 0:
-                flat[int(body[c.AT_P]) + j] = one[c.P + axis]
-                if body[c.AT_V] >= 0:
-                    flat[int(body[c.AT_V]) + j] = one[c.V + axis]
-            if spin >= 0 and body[c.AT_S] >= 0:
-                flat[int(body[c.AT_S]) + j] = one[c.S + spin]
-        if body[c.AT_Q] >= 0:
+                r[flat, int(s[body, c.AT_P]) + j] = r[one, c.P + axis]
+                if s[body, c.AT_V] >= 0:
+                    r[flat, int(s[body, c.AT_V]) + j] = r[one, c.V + axis]
+            if spin >= 0 and s[body, c.AT_S] >= 0:
+                r[flat, int(s[body, c.AT_S]) + j] = r[one, c.S + spin]
+        if s[body, c.AT_Q] >= 0:
             for k in range(4):
-                flat[int(body[c.AT_Q]) + k] = one[c.Q + k]
-        if body[c.AT_HERE] >= 0:
-            k = int(body[c.AT_HERE])
-            held = flat[k] if flat[k] != 0 else row.flat[1, k]
-            flat[k] = held if one[c.HERE] > 0 else 0.0
+                r[flat, int(s[body, c.AT_Q]) + k] = r[one, c.Q + k]
+        if s[body, c.AT_HERE] >= 0:
+            k = int(s[body, c.AT_HERE])
+            held = r[flat, k] if r[flat, k] != 0 else r[flat_at(s, 1), k]
+            r[flat, k] = held if r[one, c.HERE] > 0 else 0.0
+    for k in range(seen.shape[1]):
+        seen[b, k] = r[flat, k]
     return True
 
 
 @compiled
-def correct(s, row, tolerance, rounds, fresh, ratios):
-    """Projects the last instant onto the laws that it breaks, in turn, until none is broken or `rounds` are over."""
-    breaks = np.empty(LAWS, np.bool_)
+def correct(s, r, tolerance, rounds, fresh, ratios):
+    """Projects the last instant onto the laws that it breaks, in turn, until none is broken or `rounds` are over. A law that an
+    earlier projection mended is left out."""
     for _ in range(rounds):
         for law in range(LAWS):
-            breaks[law] = ratios[law] > 1
-        for law in range(LAWS):
-            if breaks[law]:
-                project(law, s, row)
-        if not judge(s, row, tolerance, fresh, ratios):
+            if ratios[law] > 1 and ratio_of(law, s, r, tolerance, fresh) > 1:
+                project(law, s, r)
+        if not judge(s, r, tolerance, fresh, ratios):
             break
 
 
@@ -126,30 +129,24 @@ def correct(s, row, tolerance, rounds, fresh, ratios):
 def guard_rows(s, tolerance, rounds, held, seen, fresh, allowed, ratios, way, changed, first, last):
     """Corrects `seen` [B, K] in place where `allowed` [B]. tolerance [8], 0 for laws that are not asked; held [B, 2, K]; ratios
     [B, 2, 8] and way [B, 2]: before and after; changed bool [B]."""
-    bodies, walls, width = len(s.body), len(s.wall), seen.shape[1]
-    row = RolloutRow(
-        np.zeros((3, bodies, c.INSTANT)),
-        np.empty((3, bodies, walls)),
-        np.empty((3, bodies, bodies)),
-        np.empty((3, width)),
-    )
-    before = np.empty((bodies, c.INSTANT))
+    bodies, width = count_of(s), seen.shape[1]
+    r = np.zeros((4 * bodies + 3, max(others(s, bodies), width)))
     for b in range(first, last):
         for k in range(width):
-            row.flat[0, k], row.flat[1, k], row.flat[2, k] = held[b, 0, k], held[b, 1, k], seen[b, k]
-        load(s, row)
+            r[flat_at(s, 0), k], r[flat_at(s, 1), k], r[flat_at(s, 2), k] = held[b, 0, k], held[b, 1, k], seen[b, k]
+        load(s, r)
         for i in range(3):
-            measure(s, row, i)
+            measure(s, r, i)
         for k in range(2):
-            contacts(s, row, k)
-        wrong = judge(s, row, tolerance, fresh[b], ratios[b, 0])
-        way[b, 0] = way_of(s, row)
+            contacts(s, r, k)
+        wrong = judge(s, r, tolerance, fresh[b], ratios[b, 0])
+        way[b, 0] = way_of(s, r)
         for law in range(LAWS):
             ratios[b, 1, law] = ratios[b, 0, law]
         if wrong and allowed[b]:
             for n in range(bodies):
                 for k in range(c.INSTANT):
-                    before[n, k] = row.at[2, n, k]
-            correct(s, row, tolerance, rounds, fresh[b], ratios[b, 1])
-            changed[b] = write(s, row, before, seen[b])
-        way[b, 1] = way_of(s, row)
+                    r[at(s, 3, n), k] = r[at(s, 2, n), k]
+            correct(s, r, tolerance, rounds, fresh[b], ratios[b, 1])
+            changed[b] = write(s, r, seen, b)
+        way[b, 1] = way_of(s, r)
