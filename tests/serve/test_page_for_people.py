@@ -173,6 +173,7 @@ def test_nothing_lies_on_anything_on_a_phone(serve_world, open_page, screen):  #
     page = open_page(serve_world([Range()]).url, **screen)
     width, height = screen["viewport"]["width"], screen["viewport"]["height"]
     parts = "header button, header h1, .stats dd, .buttons .icon, .pad, #extra button"
+    parts += ", #screens canvas" if screen is SIDEWAYS else ""
     boxes = page.evaluate(
         """parts => [...document.querySelectorAll(parts)].filter((node) => node.checkVisibility())
           .map((node) => [node.id || node.textContent, node.getBoundingClientRect().toJSON()])""",

@@ -98,6 +98,18 @@ def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # no
         with page.expect_download() as download:
             page.click(f"[data-file={kind}]")
         assert download.value.suggested_filename == f"a-room.{kind}"
+    page.focus("[data-film=exposure]")  # keys still walk
+    page.keyboard.down("KeyA")
+    until(page, "Math.hypot(...terrella.walker.speed) > 0")
+    page.keyboard.up("KeyA")
+    box = page.locator("[data-film=exposure]").bounding_box()
+    page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.5 * box["height"])
+    assert page.evaluate("[document.activeElement.tagName, terrella.drawing.stops > 0.5]") == ["BODY", True]
+    page.reload()  # the browser keeps the path and the exposure
+    until(
+        page, "!!window.terrella && terrella.idle && terrella.film.views.length === 3 && terrella.drawing.stops > 0.5"
+    )
+    page.keyboard.press("KeyX")
     page.evaluate("terrella.story.add({ select: { object: 1 }, do: 'delete' })")
     page.click("[data-file=ply]")
     assert "save the edits first" in page.inner_text("#toast")

@@ -450,7 +450,9 @@ def test_a_page_whose_server_is_gone_says_so_and_what_starts_it(tmp_path, opened
 
 def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, serving):
     for name, many in (("w", 1500), ("other", 600)):
-        save_splat(world(many), tmp_path / name)
+        made = world(many)
+        made.config = replace(made.config, collider="indoor")
+        save_splat(made, tmp_path / name)
     folder, merge = tmp_path / "w", merge_edit(tmp_path / "w", tmp_path / "other")
     save = lambda text: write_edits(folder, checked_edits(folder, text))  # noqa: E731
     beside = compared_scene(str(tmp_path / "other"))
@@ -463,20 +465,31 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     page.mouse.down()
     page.mouse.move(262, 30, steps=3)
     page.mouse.up()
+    near = page.evaluate("terrella.map.box.scale")
+    page.evaluate("terrella.editor.choose({ box: [3, 0, 0, 5, 4, 3] }); terrella.editor.act({ do: 'delete' })")
+    until(page, "terrella.idle && terrella.story.edits.length === 1")
+    assert page.evaluate("terrella.map.box.scale") == near
+    page.evaluate("document.getElementById('undo').click()")
     for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
         page.locator(f"#merging input[aria-label={label}]").fill(value)
     page.click("#merge")
-    until(page, "terrella.story.scene.length === 2100")
+    until(page, "terrella.story.scene.length === 2100 && terrella.idle")
+    assert page.evaluate("terrella.map.box.scale") < 0.8 * near  # the map shows what was merged
     page.keyboard.press("Control+z")
-    until(page, "terrella.story.scene.length === 1500")
+    until(page, "terrella.story.scene.length === 1500 && terrella.idle")
+    assert page.evaluate("terrella.map.box.scale") == near
     page.keyboard.press("Control+Shift+Z")
     page.evaluate("document.getElementById('save').click()")
     until(page, "!terrella.story.unsaved")
     assert read_edits(folder) == [{**merge, "by": [4, -1.5, 0], "degrees": 90}]
     there, after = page.evaluate(COLUMNS), load(folder)
     assert isinstance(after, SplatWorld) and np.allclose(rows(there["means"]), rows(after.gaussians.means), atol=1e-5)
+    assert main(["space", "export", str(folder), str(tmp_path / "both.html")]) == 0
     page.reload()
     until(page, "!!window.terrella && terrella.story.scene.length === 2100")
+    for shown in (page, opened((tmp_path / "both.html").as_uri())):  # what stops walkers is closed as in Python
+        until(shown, f"terrella.solid.solid.reduce((sum, one) => sum + one, 0) === {int(after.occupancy.solid.sum())}")
+        assert shown.evaluate("Array.from(terrella.solid.size)") == list(after.occupancy.solid.shape)
     alone = opened(serving(build_place(EditablePlace(unedited_scene(str(folder)), list, save))))
     assert not alone.is_visible("#merging")
 

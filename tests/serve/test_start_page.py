@@ -185,6 +185,16 @@ def test_a_plan_is_drawn_with_the_mouse_and_built_and_a_picture_dropped(browser,
         drag([2, 1], [2.5, 1.5])
         assert page.evaluate("plan.plan.rooms.map(({ box }) => box)") == [[0, 0, 4, 3], [4, 0, 6, 3]]
         assert page.evaluate("plan.plan.things") == [{"label": "sofa", "at": [2.5, 1.5], "facing": "east"}]
+        page.select_option("#kind", "kitchen")
+        drag([0.5, 0.5], [0.5, 1.5])  # a room takes along what stands in it
+        page.focus("#board")
+        page.keyboard.press("ArrowUp")
+        assert page.evaluate("[plan.plan.rooms[0].box, plan.plan.things[0].at]") == [[0, 1.25, 4, 4.25], [2.5, 2.75]]
+        page.keyboard.press("Delete")
+        assert page.evaluate("[plan.plan.rooms.length, plan.plan.things.length]") == [1, 0]
+        for _ in range(3):
+            page.click("#undo")
+        assert page.evaluate("[plan.plan.rooms[0].box, plan.plan.things[0].at]") == [[0, 0, 4, 3], [2.5, 1.5]]
         for _ in range(3):
             page.click("#undo")
         assert page.evaluate("[plan.plan.rooms.length, plan.plan.things.length]") == [2, 0]
@@ -226,7 +236,8 @@ def test_a_place_of_a_plain_picture_opens_with_a_warning(tmp_path):
     shelf, file = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent), io.BytesIO()
     Image.new("RGB", (96, 64), "grey").save(file, "PNG")
     out = shelf.lift("grey.png", file.getvalue())
-    assert "the picture is plain" in unedited_scene(out).note
+    note = unedited_scene(out).note
+    assert "the picture is plain" in note and note.startswith("beside and behind what the picture shows is nothing")
     shelf.open(out)
     assert shelf.progress() == "opening the place"
 

@@ -12,7 +12,7 @@ import terrella
 from terrella.cli import main
 from terrella.core import check_world
 from terrella.core.errors import CheckpointError, DatasetError, ObservationError
-from terrella.space.camera import planar_pose
+from terrella.space.camera import planar_pose, rotation
 from terrella.space.files import read_scene, write_scene
 from terrella.worlds import splat_folder
 from terrella.worlds.splat import BUTTONS, SplatConfig, SplatWorld
@@ -155,3 +155,11 @@ def test_a_crash_between_two_files_loses_no_edit(tmp_path, monkeypatch):
         monkeypatch.setattr(splat_folder, "replace_whole", replace_whole)
         left = read_edits(tmp_path) + read_edits(tmp_path, UNDONE_FILE)
         assert one in left and two in left
+
+
+def test_an_imported_room_begins_looking_where_most_is_seen():
+    hall = room(count=6000)
+    long = replace(hall, means=hall.means * torch.tensor([1.0, 3.0, 1.0]))  # 12 m along y
+    world = world_of(long, "long", {}, SplatConfig(LENS, SIZE))
+    ahead = rotation(world.starts)[:, :, 0]
+    assert 1 <= len(world.starts) < 8 and bool((ahead[:, 1].abs() > 0.6).all()) and abs(float(ahead[0, 1])) > 0.9

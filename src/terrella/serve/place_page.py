@@ -9,7 +9,7 @@ import html
 import json
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,7 @@ class PlacePage:
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
-            "closed": place.closed,
+            "closed": place.closed, "after": None if save or watch else self._collider_after(edits),
             "command": starting_command() if save or watch or frames else "",
         }  # fmt: skip
         parts = {
@@ -106,6 +106,13 @@ class PlacePage:
             things.append({"edit": edit, "about": about, "data": packed})
         return json.dumps({"things": things, "unknown": put.unknown}).encode()
 
+    def _collider_after(self, edits: Sequence[Edit]) -> dict[str, Any] | None:
+        """What stops walkers after edits that merge a place, for pages that cannot ask for it; None: the page reads it off the
+        Gaussians."""
+        if self._place.collider_after is None or all(_OWN.fullmatch(edit["place"]) for edit in merges_of(edits)):
+            return None
+        return packed_collider(self._place.collider_after(edits))
+
     def _opened(self, edit: Edit) -> tuple[dict[str, Any], str]:
         """The place that a merge adds, as the page reads it: its description and its packed Gaussians."""
         key = _merge_key(edit)
@@ -123,7 +130,9 @@ def _merge_key(edit: Edit) -> tuple[str, str]:
 def _packed_whole(place: PlaceScene) -> tuple[dict[str, Any], str]:
     """A place in one part, as scene.js unpacks it: its description, and its columns in gzip and base64."""
     packed = gzip.compress(_packed(place, torch.ones(len(place.gaussians), dtype=torch.bool)), 6, mtime=0)
-    about = {"count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names)}
+    about = {
+        "count": len(place.gaussians), "boxes": _boxes(place), "objects": list(place.names), "closed": place.closed,
+    }  # fmt: skip
     return about, base64.b64encode(packed).decode()
 
 
@@ -212,6 +221,14 @@ def _packed_solid(occupancy: Occupancy | Solids) -> tuple[dict[str, Any], bytes]
     return about, np.packbits(solid.ravel()).tobytes() + within[solid].tobytes()
 
 
+def packed_collider(collider: Occupancy | Solids) -> dict[str, Any]:
+    """A collider as solid.js unpacks it by itself: boxes, or a description and its cells in gzip and base64."""
+    if isinstance(collider, Solids):
+        return {"boxes": collider.boxes.tolist()}
+    about, cells = _packed_solid(collider)
+    return {"boxes": [], "solid": about, "data": base64.b64encode(gzip.compress(cells, 6, mtime=0)).decode()}
+
+
 def _boxes(place: PlaceScene) -> list[list[float]]:
     return place.collider.boxes.tolist() if isinstance(place.collider, Solids) else []
 
@@ -251,13 +268,7 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         with lock:
             if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
                 raise ServeError("the place was edited elsewhere since this page was opened; reload the page.")
-            lines = [json.loads(line) for line in posted_edits["lines"].splitlines() if line]
-            if any(
-                _merge_key(edit) not in page.merged and not _OWN.fullmatch(edit["place"]) for edit in merges_of(lines)
-            ):
-                raise ServeError(
-                    "this page merges only the place that it was opened beside: `terrella space view PLACE --beside OTHER`."
-                )
+            _edits_of(page, posted_edits["lines"])
             place.save(posted_edits["lines"])
 
     def write_file(content: bytes) -> bytes:
@@ -272,14 +283,11 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
 
-    async def keep(request: Request) -> Response:
-        return await _answer(request, LONGEST_EDITS, save, "edits are lines of JSON")
-
-    async def put(request: Request) -> Response:
-        return await _answer(request, LONGEST_WISH, build_things, "a thing has words and a spot")
-
-    async def write(request: Request) -> Response:
-        return await _answer(request, LONGEST_WISH, write_file, "a file has a kind")
+    def close(content: bytes) -> bytes:
+        edits, after = _edits_of(page, _wished(place, content)["lines"]), scene.collider_after
+        assert after is not None
+        with lock:
+            return json.dumps(packed_collider(after(edits))).encode()
 
     async def draw(request: Request) -> Response:
         try:
@@ -287,14 +295,28 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)
 
-    routes = [Route("/edits", keep, methods=["POST"]), Route("/frame", draw)]
-    routes += [Route("/things", put, methods=["POST"])] if place.put else []
-    routes += [Route("/files", write, methods=["POST"])] if place.export else []
-    more = {"key": place.key} | {
-        name: f"/{name}" for name, does in (("things", place.put), ("files", place.export)) if does
-    }
+    offered = [
+        ("edits", save, LONGEST_EDITS, "edits are lines of JSON"),
+        ("things", build_things if place.put else None, LONGEST_WISH, "a thing has words and a spot"),
+        ("files", write_file if place.export else None, LONGEST_WISH, "a file has a kind"),
+        ("collider", close if scene.collider_after else None, LONGEST_EDITS, "edits are lines of JSON"),
+    ]
+    routes = [Route("/frame", draw)] + [
+        Route(f"/{name}", _posting(work, most, form), methods=["POST"]) for name, work, most, form in offered if work
+    ]
+    more = {"key": place.key} | {name: f"/{name}" for name, work, *_ in offered[1:] if work}
     html = lambda: page.html(place.edits(), "/edits", frames="/frame", more=more)  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
+
+
+def _edits_of(page: PlacePage, lines: str) -> list[Edit]:
+    """The edits in lines of JSON; ServeError where they merge a place that the page does not know."""
+    edits = [json.loads(line) for line in lines.splitlines() if line]
+    if any(_merge_key(edit) not in page.merged and not _OWN.fullmatch(edit["place"]) for edit in merges_of(edits)):
+        raise ServeError(
+            "this page merges only the place that it was opened beside: `terrella space view PLACE --beside OTHER`."
+        )
+    return edits
 
 
 def _wished(place: EditablePlace, content: bytes) -> Mapping[str, Any]:
@@ -307,15 +329,19 @@ def _wished(place: EditablePlace, content: bytes) -> Mapping[str, Any]:
     return wish
 
 
-async def _answer(request: Request, most: int, work: Callable[[bytes], bytes | None], form: str) -> Response:
-    """What `work` makes of the body of a POST of `most` bytes at most; a sentence where it cannot. form: what a body is."""
-    try:
-        content = await run_in_threadpool(work, await posted(request, most))
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        return PlainTextResponse(f"{form}; reload the page.", 422)
-    except TerrellaError as error:
-        return PlainTextResponse(str(error), 422)
-    return Response(content or b"", media_type="application/json" if content else "text/plain")
+def _posting(work: Callable[[bytes], bytes | None], most: int, form: str) -> Callable[[Request], Awaitable[Response]]:
+    """Answers POSTs with what `work` makes of a body of `most` bytes at most; a sentence where it cannot. form: what a body is."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            content = await run_in_threadpool(work, await posted(request, most))
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+            return PlainTextResponse(f"{form}; reload the page.", 422)
+        except TerrellaError as error:
+            return PlainTextResponse(str(error), 422)
+        return Response(content or b"", media_type="application/json" if content else "text/plain")
+
+    return answer
 
 
 def serve_place(

@@ -31,3 +31,4 @@ class PlaceScene:
     other: Callable[[Edit], PlaceScene] | None = None  # opens the place that an edit merges
     note: str = ""  # a sentence that the page shows when it opens
     closed: bool = False  # the collider says more than what the Gaussians fill (space/enclosure.py)
+    collider_after: Callable[[Sequence[Edit]], Occupancy | Solids] | None = None  # what stops a walker after edits

@@ -235,6 +235,11 @@ def _result(
         f"{layers.camera}camera {layers.height_m:.2f} m above the floor; depth {near:.1f} to {far:.1f} m",
         expected_error(measured),
         *notes,
+        *(
+            []
+            if "panorama" in facts
+            else [f"beside and behind the camera is nothing: terrella space grow {out} invents it"]
+        ),
         f"walk in it: terrella play {out}",
     ]
     return SpaceResult(facts, tuple(lines))

@@ -1,5 +1,7 @@
-"""A place that is made in the background: it can be polled, also by another program, and resumed once its process has ended."""
+"""A place that is made in the background: it can be polled, also by another program, and resumed once its process has ended. While
+it is made, its process holds the lock of a file beside the record: a process number alone may be that of another one by now."""
 
+import fcntl
 import json
 import os
 import threading
@@ -7,7 +9,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Literal
 
 from ..core.errors import TerrellaError
 from ..learn.recipes.splat_views import SplatFit
@@ -15,7 +17,7 @@ from ..space.files import replace_whole
 from .generate_place import KINDS, PlaceConfig, Source, checked_source, make_place
 from .splat_places import SpaceResult
 
-ENDING = ".job.json"  # of a job's record, which lies beside the folder of its place
+ENDING, LOCK = ".job.json", ".job.lock"  # of a job's record and its lock, which lie beside the folder of its place
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class PlaceJob:
             "source": {name: source}, "config": asdict(settings), "process": os.getpid(), "began": self._began,
         }  # fmt: skip
         self._status = PlaceStatus("running", "starting", 0.0)
+        self._lock = _hold(out)
         self._note("running", "starting")
         self._thread = threading.Thread(target=self._run, args=(name, source, settings), daemon=True)
         self._thread.start()
@@ -65,6 +68,9 @@ class PlaceJob:
         else:
             self._lines = result.lines
             self._note("done", "", result.to_json())
+        finally:
+            _lock_of(self._out).unlink(missing_ok=True)
+            self._lock.close()
 
     def _note(
         self, state: Literal["running", "done", "failed"], text: str, facts: Mapping[str, Any] | None = None
@@ -85,7 +91,7 @@ def start_place(out: str | Path, *, config: PlaceConfig | None = None, **source:
 def place_status(out: str | Path) -> PlaceStatus:
     """How far the place in the folder `out` is, of whichever program makes it; TerrellaError if none ever began it."""
     record = _read(Path(out))
-    ended = record["state"] == "running" and not _is_alive(record["process"])
+    ended = record["state"] == "running" and not _is_held(Path(out))
     text = "its process ended; terrella.resume_place goes on" if ended else record["text"]
     return PlaceStatus("stopped" if ended else record["state"], text, record["seconds"], record["facts"])
 
@@ -126,18 +132,36 @@ def _read(out: Path) -> dict[str, Any]:
 
 
 def _check_idle(out: Path) -> None:
-    if not _record_of(out).exists():
-        return
-    record = _read(out)
-    if record["state"] == "running" and _is_alive(record["process"]):
-        raise TerrellaError(f"{out} is being made by process {record['process']}; wait for it, or end that.")
+    if _is_held(out):
+        number = _read(out)["process"] if _record_of(out).exists() else "of another program"
+        raise TerrellaError(f"{out} is being made by process {number}; wait for it, or end that.")
 
 
-def _is_alive(process: int) -> bool:
+def _lock_of(out: Path) -> Path:
+    return out.with_name(out.name + LOCK)
+
+
+def _hold(out: Path) -> IO[str]:
+    """The lock of a job, held until it is closed or the process ends. TerrellaError where another one holds it."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    handle = _lock_of(out).open("a")
     try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError, ValueError):
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        handle.close()
+        _check_idle(out)
+        raise
+    os.set_inheritable(handle.fileno(), False)
+    return handle
+
+
+def _is_held(out: Path) -> bool:
+    """Whether a running process holds the lock of a job."""
+    try:
+        with _lock_of(out).open() as handle:
+            fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
         return False
-    except PermissionError:
+    except BlockingIOError:
         return True
-    return process > 0
+    return False

@@ -1,7 +1,7 @@
 """Opens places of Gaussians by name, as worlds and as the content of their pages."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from ..worlds.additions import OBSERVED
 from ..worlds.folder import open_world
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import load_source, merged_loader, world_of
+
+NOTHING_BEHIND = "beside and behind what the picture shows is nothing: `terrella space grow` invents the rest of a room"
 
 
 @dataclass(frozen=True)
@@ -69,14 +71,17 @@ def unheeded(card: Mapping[str, Any]) -> list[str]:
 def _notes(card: Mapping[str, Any]) -> list[str]:
     """What the page says of a place when it opens: words without effect, or why what was made of a picture may be poor."""
     doubts = card.get("doubts")
-    return [*unheeded(card), *(str(one).rstrip(".") for one in (doubts if isinstance(doubts, list) else ()))]
+    framed = [NOTHING_BEHIND] if "picture" in card else []
+    return [*unheeded(card), *framed, *(str(one).rstrip(".") for one in (doubts if isinstance(doubts, list) else ()))]
 
 
 def unedited_scene(world: str) -> PlaceScene:
     """The content of the page of a world of Gaussians, before all edits."""
     open_splat(world)  # refuses other kinds of worlds
-    other = merged_loader(folder_of(world))
-    return page_scene(load_source(folder_of(world)), lambda edit: page_scene(other(edit), walked=False))
+    folder = folder_of(world)
+    other = merged_loader(folder)
+    scene = page_scene(load_source(folder), lambda edit: page_scene(other(edit), walked=False))
+    return replace(scene, collider_after=lambda edits: load_source(folder, edits).collider)
 
 
 def compared_scene(name: str) -> PlaceScene:

@@ -21,13 +21,14 @@ from ..space.edits import Edit, Edited, apply_edits, merged_boxes, merges_of
 from ..space.enclosure import ColliderChoice, ColliderKind, in_free_space, kind_of_place
 from ..space.files import replace_whole
 from ..space.occupancy import Occupancy, Walker
-from ..space.raster import Gaussians
+from ..space.raster import Gaussians, rasterise
 from .additions import INVENTED, OBSERVED
 from .checkpoint import WORLD_FILE, data_file, read_data, write_checkpoint
 from .collider_file import COLLIDER_FILE, EDITED_FILE
 from .splat import SolidBoxes, SplatConfig, SplatWorld
 
 KIND, VERSION = "splat", 1
+FAR_M, NEARLY = 8.0, 0.8  # of the first views: how far they see, and the share of the best one's reach
 MOST_ADDITIONS = 10_000_000
 EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # edits in force; edits taken back, the newest last
 
@@ -117,11 +118,14 @@ def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], Sp
     merged = [other(edit) for edit in merges_of(edits)]
     provenance = torch.cat([source.provenance, *(one.provenance for one in merged)])
     provenance = torch.where(after.origin < 0, INVENTED, provenance[after.origin]).to(torch.uint8)
-    card, names = dict(source.card), source.object_names
+    card, names, config = dict(source.card), source.object_names, source.config
+    if len(source.solids):  # its boxes did not say how Gaussians close it; what was merged does
+        kinds = (one.config.collider for one in merged if not len(one.solids) and one.config.collider != "object")
+        config = replace(config, collider=next(kinds, config.collider))
     for lift, one in zip(after.raised, merged):
         names = [*names, *[""] * lift][:lift] + one.object_names
     return SplatWorld(
-        source.name, after.gaussians, provenance, source.starts, source.config, {**card, "objects": names} if merged else card,
+        source.name, after.gaussians, provenance, source.starts, config, {**card, "objects": names} if merged else card,
         after.objects, _solids(source, edits, merged, after),
     )  # fmt: skip
 
@@ -252,7 +256,8 @@ def world_of(
     choice: ColliderChoice = "open",
 ) -> SplatWorld:
     """A world of Gaussians that starts at the free place with a floor that is nearest to `config.inside`, or else to their middle,
-    in eight directions. choice: how the grid that stops bodies is closed; auto: as the place looks from the start."""
+    in those of eight directions in which most is seen, the best first. choice: how the grid that stops bodies is closed; auto: as
+    the place looks from the start."""
     observed = torch.full((len(gaussians),), OBSERVED, dtype=torch.uint8)
     world = SplatWorld(name, gaussians, observed, torch.zeros(1, 7), config, card, objects, solids)
     some = gaussians.means[:: max(len(gaussians) // 100_000, 1)]
@@ -268,8 +273,21 @@ def world_of(
     order = (places - middle).norm(dim=1) + 1e3 * ~stands
     x, y, z = places[order.argmin()].expand(8, 3).unbind(1)
     starts = planar_pose(x, y, z, torch.arange(8) * (torch.pi / 4))
+    starts = starts[_open_ways(gaussians, starts)]
     config = replace(config, collider=chosen_collider(world.occupancy, starts, config, choice))
     return SplatWorld(name, gaussians, observed, starts, config, card, objects, solids)
+
+
+def _open_ways(gaussians: Gaussians, poses: torch.Tensor) -> torch.Tensor:
+    """The numbers of poses [P, 7] that see nearly as much as the best, which comes first: into the distance, up to FAR_M, and not
+    into nothing."""
+    with torch.no_grad():
+        drawn = [rasterise(gaussians, pose[None], (0.5, 0.67, 0.5, 0.5), (48, 64)) for pose in poses]
+    reach = torch.stack(
+        [(one.depth / one.alpha.clamp_min(0.5)).clamp_max(FAR_M).mul(one.alpha >= 0.5).mean() for one in drawn]
+    )
+    order = reach.argsort(descending=True, stable=True)
+    return order[reach[order] >= NEARLY * reach.max()]
 
 
 def chosen_collider(

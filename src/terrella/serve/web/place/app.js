@@ -69,7 +69,8 @@ if (ready) run(ready);
 
 function run({ drawing, source, story, solid: first }) {
   let solid = first, made = '';
-  const walker = new Walker(world), orbit = new Orbit(walker), map = new MiniMap($('minimap').querySelector('canvas'));
+  const closed = new Map();  // what stops walkers after edits, by their lines
+  const walker = new Walker(world), orbit = new Orbit(walker), map = new MiniMap($('minimap').querySelector('canvas'), source);
   const sorter = new Sorter(({ order, coarse, all, view }) => { drawing.order(order, coarse); Object.assign(seen, { visible: all, looked: view.looks }); redraw(); });
   const hands = new Hands(canvas, $('stick'), {
     moved: walks, tool: (name, event) => editor.open && editor.selecting.handle(name, event), look,
@@ -84,7 +85,7 @@ function run({ drawing, source, story, solid: first }) {
   const film = new Film($('film'), {
     eye: () => walker.eye, stand: ([x, y, z, heading, pitch]) => { if (orbit.on) turnAround(); walker.set([x, y, z], heading, pitch, true); redraw(); },
     picture, unsaved: () => story.unsaved, expose: (stops) => { drawing.stops = stops; redraw(); }, redraw: () => redraw(), say: toast,
-    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', address: world.files, command: world.command, key: world.key,
+    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', kept: `terrella-film ${[world.name, world.count, ...world.starts[0]].join()}`, address: world.files, command: world.command, key: world.key,
   });
 
   /** The view as a picture, without lines: a blob of PNG. */
@@ -102,14 +103,36 @@ function run({ drawing, source, story, solid: first }) {
   function take(scene) {
     drawing.set(scene, seen.stands);
     sorter.set(scene);
-    solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : world.closed && !story.edits.some((edit) => edit.do === 'merge') ? first.edited(source, scene, world.samples) : Solid.of(scene, world.samples);
-    map.layer = null;
+    solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : closed.get(story.lines) ?? (world.closed ? first.edited(source, scene, world.samples) : Solid.of(scene, world.samples));
+    if (scene !== source && story.edits.some(closes)) close(story.lines);
+    Object.assign(map, { layer: null }, map.source === source ? {} : { source, own: null });
     seen.sorted = '';
     $('what').textContent = `${seen.stands > 1 ? `${scene.length.toLocaleString('en')} of ${world.count.toLocaleString('en')}` : scene.length.toLocaleString('en')} Gaussians${made}`;
     const drawn = scene.opacities.reduce((sum, one) => sum + (one > 0), 0), known = scene.seen.reduce((sum, one, k) => sum + (one && scene.opacities[k] > 0), 0) / Math.max(drawn, 1);
     $('share-seen').textContent = `${Math.round(100 * known)}%`;
     $('share-invented').textContent = `${Math.round(100 * (1 - known))}%`;
     redraw();
+  }
+
+  /** Whether a merge changes what is inside: one of a place, not of a thing, where either of both is closed. */
+  function closes({ do: does, place, sha256 }) {
+    return does === 'merge' && !place.startsWith('things/') && (world.closed || story.others.get(sha256)?.closed) && !story.scene.boxes;
+  }
+
+  /** What stops walkers after merges, as Python computes it: of the server, or what came with the page. */
+  async function close(lines) {
+    if (closed.has(lines)) return;
+    const given = !world.collider && lines === story.saved ? world.after : null;
+    if (!given && !world.collider) return;
+    closed.set(lines, solid);  // till it comes
+    try {
+      const { boxes, solid: about, data } = given ?? await (await reach(world.collider + location.search, world.command, { method: 'POST', body: JSON.stringify({ lines, key: world.key }) })).json();
+      closed.set(lines, boxes.length ? new Boxes(boxes) : Solid.unpack(new Reader(await inflate(decoded(data))), about));
+      if (lines === story.lines) { solid = closed.get(lines); redraw(); }
+    } catch (error) {
+      closed.delete(lines);
+      toast(error.message);
+    }
   }
 
   /** A newer state of a place that is being made. */
@@ -245,7 +268,7 @@ function run({ drawing, source, story, solid: first }) {
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
   const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editing(), KeyK: () => $('filming').hidden || film.add(), KeyX: () => $('filming').hidden || filming(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
   addEventListener('keydown', (event) => {
-    if (event.target.closest?.('input')) return;
+    if (event.target.closest?.('input:not([type=range]), textarea')) return;
     if (event.code === 'KeyZ' && (event.ctrlKey || event.metaKey)) { event.preventDefault(); $(event.shiftKey ? 'redo' : 'undo').click(); }
     else if (!event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey && shortcuts[event.code]) { event.preventDefault(); shortcuts[event.code](); }
   });
@@ -297,7 +320,7 @@ function run({ drawing, source, story, solid: first }) {
 
   // the state of the page, for scripts
   window.terrella = {
-    story, editor, film, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
+    story, editor, film, map, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
     get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
     pixels() {

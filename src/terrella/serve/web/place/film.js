@@ -18,7 +18,7 @@ export function glideAt(views, share) {
 
 export class Film {
   /** panel: its parts are named by data-film and data-file; on: eye(), stand(view), picture() -> promise of a blob, unsaved(), expose(stops),
-   * redraw(), say(text), name, address, command, key. */
+   * redraw(), say(text), name, kept (under which name the browser keeps the path), address, command, key. */
   constructor(panel, on) {
     Object.assign(this, { panel, on, views: [], playing: 0, open: false });
     const part = (name) => panel.querySelector(`[data-film=${name}]`);
@@ -26,13 +26,31 @@ export class Film {
     this.parts.add.onclick = () => this.add();
     this.parts.preview.onclick = () => this.preview();
     this.parts.exposure.oninput = () => this.expose();
-    this.parts.exposure.ondblclick = () => { this.parts.exposure.value = 0; this.expose(); };
+    this.parts.exposure.ondblclick = () => { this.parts.exposure.value = 0; this.expose(); this.keep(); };
     panel.querySelectorAll('[data-file]').forEach((button) => {
       button.hidden = !on.address && button.dataset.file !== 'png';
       button.onclick = () => this.download(button.dataset.file, button);
     });
+    this.parts.exposure.onpointerup = () => this.parts.exposure.blur();  // else the arrow keys would go on moving it
+    this.recall();
     for (const kind of ['pointerdown', 'keydown']) addEventListener(kind, (event) => { if (!event.target.closest?.('[data-film=preview]')) this.stop(); });
     this.show();
+  }
+
+  /** Takes the path and the exposure that this browser kept of the place. */
+  recall() {
+    try {
+      const { views, seconds, stops } = JSON.parse(localStorage.getItem(this.on.kept)), numbers = (view) => view.length === 5 && view.every(Number.isFinite);
+      this.views = views.filter(numbers).slice(0, MOST);
+      this.parts.seconds.value = Number(seconds) || 8;
+      this.parts.exposure.value = Number(stops) || 0;
+      this.expose();
+    } catch { /* nothing kept, or a browser that keeps nothing */ }
+    this.parts.seconds.onchange = this.parts.exposure.onchange = () => this.keep();
+  }
+
+  keep() {
+    try { localStorage.setItem(this.on.kept, JSON.stringify({ views: this.views, seconds: this.seconds, stops: this.stops })); } catch { /* it is lost with the page then */ }
   }
 
   toggle(open = !this.open) {
@@ -49,6 +67,7 @@ export class Film {
     if (this.views.length >= MOST) { this.on.say(`A path has ${MOST} views at most.`); return; }
     const { place, heading, pitch } = this.on.eye();
     this.views.push([...place, heading, pitch]);
+    this.keep();
     if (!this.open) this.on.say(`View ${this.views.length} of the camera path is kept; X shows the path.`);
     this.show();
   }
@@ -123,7 +142,7 @@ export class Film {
     parts.views.replaceChildren(...views.map((view, at) => {
       const chip = document.createElement('span'), go = document.createElement('button'), drop = document.createElement('button');
       Object.assign(go, { textContent: at + 1, title: 'Go there', onclick: () => this.on.stand(view) });
-      Object.assign(drop, { textContent: '×', title: 'Remove', ariaLabel: `Remove view ${at + 1}`, onclick: () => { this.views.splice(at, 1); this.show(); } });
+      Object.assign(drop, { textContent: '×', title: 'Remove', ariaLabel: `Remove view ${at + 1}`, onclick: () => { this.views.splice(at, 1); this.keep(); this.show(); } });
       chip.append(go, drop);
       return chip;
     }));

@@ -10,7 +10,8 @@ export class Hands {
     Object.assign(this, { held: new Set(), fingers: new Map(), thumb: [0, 0], on, fast: false });
     addEventListener('keydown', (event) => {
       this.fast = event.shiftKey;
-      if (event.target.closest?.('input, textarea') || event.ctrlKey || event.metaKey || event.altKey) return;
+      const slider = event.target.closest?.('[type=range]') && /^(Arrow|Page|Home|End)/.test(event.code);  // it takes these keys alone
+      if (slider || event.target.closest?.('input:not([type=range]), textarea') || event.ctrlKey || event.metaKey || event.altKey) return;
       if (on.key(event)) { event.preventDefault(); return; }
       if (!(event.code in KEYS)) return;
       if (event.target.closest?.('button') && event.code === 'Space') return;

@@ -2,18 +2,34 @@
 
 const ABOVE = 0.35, STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50];
 
+/** Between which x, and y, all but a few of the opaque Gaussians from one number to another lie; null: there are none. */
+function middle({ means, opacities }, from, to) {
+  const some = Array.from({ length: to - from }, (_, k) => from + k).filter((k) => opacities[k] > 0.3);
+  return some.length ? [0, 1].flatMap((a) => {
+    const sorted = Float32Array.from(some, (k) => means[3 * k + a]).sort();
+    return [0.002, 0.998].map((share) => sorted[Math.round(share * (sorted.length - 1))]);
+  }) : null;
+}
+
 export class MiniMap {
-  constructor(canvas) { Object.assign(this, { canvas, layer: null }); }
+  /** source: the scene before its edits, whose ends the map keeps; what edits add widens them. */
+  constructor(canvas, source) { Object.assign(this, { canvas, source, layer: null }); }
+
+  /** The ends [x0, x1, y0, y1] of what the map shows. */
+  ends(scene) {
+    const { boxes, length } = this.source;
+    this.own ??= boxes ? [0, 1].flatMap((a) => [Math.min(...boxes.map((one) => one[a])), Math.max(...boxes.map((one) => one[3 + a]))]) : middle(this.source, 0, length) ?? [0, 1, 0, 1];  // windows show what lies beyond walls
+    const more = middle(scene, length, scene.length) ?? this.own;
+    return this.own.map((end, k) => (k % 2 ? Math.max(end, more[k]) + 0.3 : Math.min(end, more[k]) - 0.3));
+  }
 
   /** Paints what lies below a height into a picture of its own. */
   take(scene, top) {
     const ratio = Math.min(2, devicePixelRatio || 1), width = Math.round(this.canvas.clientWidth * ratio), height = Math.round(this.canvas.clientHeight * ratio);
     if (!width || !height) return;
-    const { means, scales, colours, opacities, length, boxes } = scene, some = [];
+    const { means, scales, colours, opacities, length } = scene, some = [];
     for (let k = 0; k < length; k += 1) if (means[3 * k + 2] < top && opacities[k] > 0.3) some.push(k);
-    const walls = (a) => [Math.min(...boxes.map((one) => one[a])), Math.max(...boxes.map((one) => one[3 + a]))];  // windows show what lies beyond
-    const edge = (a, share) => boxes ? walls(a)[Number(share > 0.5)] : Float32Array.from(some, (k) => means[3 * k + a]).sort()[Math.round(share * (some.length - 1))] ?? 0;
-    const box = [edge(0, 0.002) - 0.3, edge(0, 0.998) + 0.3, edge(1, 0.002) - 0.3, edge(1, 0.998) + 0.3], inset = 8 * ratio;
+    const box = this.ends(scene), inset = 8 * ratio;
     const scale = Math.min((width - 2 * inset) / (box[1] - box[0]), (height - 2 * inset) / (box[3] - box[2]));
     Object.assign(this.canvas, { width, height });
     this.box = { scale, x: width / 2 - (scale * (box[0] + box[1])) / 2, y: height / 2 + (scale * (box[2] + box[3])) / 2 };

@@ -59,12 +59,13 @@ export class Reader {
   }
 }
 
-export function unpackScene(reader, { count, objects, boxes }) {
+export function unpackScene(reader, { count, objects, boxes, closed }) {
   const means = reader.take(3 * count, Float32Array), packed = reader.take(count, Uint32Array);
   const scales = Float32Array.from(reader.take(3 * count), (byte) => Math.exp(byte / 16 - 10));
   const colours = Float32Array.from(reader.take(3 * count), (byte) => byte / 204);
   const opacities = Float32Array.from(reader.take(count), (byte) => byte / 255);
-  return new Scene({ means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Int32Array) }, objects, boxes?.length ? boxes : null);
+  const columns = { means, quats: unpackQuats(packed), scales, colours, opacities, seen: reader.take(count), objects: reader.take(count, Int32Array) };
+  return Object.assign(new Scene(columns, objects, boxes?.length ? boxes : null), { closed });
 }
 
 /** Which of w, x, y, z is largest in 2 bits, the three others in 10 each. */

@@ -3,7 +3,7 @@
 import { make, go, address } from './asking.js';
 
 const $ = (id) => document.getElementById(id), NS = 'http://www.w3.org/2000/svg', KEPT = 'terrella-plan';
-const SNAP = 0.25, LEAST = 1.5, CORNER = 0.16, FINGER = 0.3, VIEW = { x: -1, y: -1, wide: 18, tall: 11 };
+const SNAP = 0.25, LEAST = 1.5, WALL = 0.3, CORNER = 0.16, FINGER = 0.3, VIEW = { x: -1, y: -1, wide: 18, tall: 11 };
 const FACINGS = ['south', 'east', 'north', 'west'], MOVES = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const state = { plan: { rooms: [], things: [] }, past: [], chosen: null, tool: 'room', drag: null };
 const { rooms: kinds, things: labels } = await (await fetch(address('/start/kinds'))).json();
@@ -43,6 +43,18 @@ function under([x, y], touch) {
   return room >= 0 ? { list: 'rooms', at: room } : null;
 }
 
+/** The things in a room, doors and windows in its walls too. */
+const within = ({ box: [a, b, c, d] }) => state.plan.things.filter(({ label, at: [x, y] }) => {
+  const by = label === 'door' || label === 'window' ? WALL : 0;
+  return x >= a - by && x <= c + by && y >= b - by && y <= d + by;
+});
+
+/** A room or thing as it is now, with what a room holds: a function that puts all of it `by` metres from there. */
+function carry(one) {
+  const parts = [one, ...(one.box ? within(one) : [])].map((part) => [part, part.box ? 'box' : 'at']).map(([part, key]) => [part, key, [...part[key]]]);
+  return (by) => { for (const [part, key, was] of parts) part[key] = was.map((value, k) => (one.box ? value + by[k % 2] : Math.round((value + by[k % 2]) * 20) / 20)); };
+}
+
 const copy = () => JSON.stringify(state.plan);
 function keep(before) {
   if (before === copy()) return;
@@ -57,10 +69,10 @@ board.onpointerdown = (event) => {
   if (state.tool === 'thing' && hit?.list !== 'things') {
     state.plan.things.push({ label: $('label').value, at: at.map((part) => Math.round(part * 20) / 20), facing: 'south' });
     state.chosen = { list: 'things', at: state.plan.things.length - 1 };
-    state.drag = { does: 'move', from: at, before, was: [...at] };
+    state.drag = { does: 'move', from: at, before, carry: carry(about(state.chosen)) };
   } else if (hit) {
     state.chosen = { list: hit.list, at: hit.at };
-    state.drag = { does: hit.corner ? 'corner' : 'move', corner: hit.corner, from: at, before, was: [...(about(hit).box ?? about(hit).at)] };
+    state.drag = { does: hit.corner ? 'corner' : 'move', corner: hit.corner, from: at, before, carry: carry(about(hit)) };
   } else {
     state.chosen = null;
     state.drag = { does: 'draw', from: at.map(snap), to: at.map(snap), before };
@@ -74,8 +86,7 @@ board.onpointermove = (event) => {
   const at = place(event), by = at.map((part, a) => part - drag.from[a]);
   if (drag.does === 'draw') drag.to = at.map(snap);
   else if (drag.does === 'corner') drag.corner.forEach((k, a) => { about(chosen).box[k] = snap(at[a]); });
-  else if (chosen.list === 'rooms') about(chosen).box = drag.was.map((part, k) => part + snap(by[k % 2]));
-  else about(chosen).at = drag.was.map((part, a) => Math.round((part + by[a]) * 20) / 20);
+  else drag.carry(chosen.list === 'rooms' ? by.map(snap) : by);
   draw();
 };
 
@@ -106,7 +117,12 @@ function change(does) {
 
 const actions = {
   turn: () => state.chosen?.list === 'things' && change(() => { const one = about(state.chosen); one.facing = FACINGS[(FACINGS.indexOf(one.facing) + 1) % 4]; }),
-  remove: () => state.chosen && change(() => { state.plan[state.chosen.list].splice(state.chosen.at, 1); state.chosen = null; }),
+  remove: () => state.chosen && change(() => {
+    const { plan, chosen } = state, gone = chosen.list === 'rooms' ? within(about(chosen)) : [];
+    plan[chosen.list].splice(chosen.at, 1);
+    Object.assign(plan, { things: plan.things.filter((one) => !gone.includes(one)) });  // what stood in it goes with it
+    state.chosen = null;
+  }),
   undo: () => { if (state.past.length) { Object.assign(state, { plan: JSON.parse(state.past.pop()), chosen: null }); localStorage.setItem(KEPT, copy()); draw(); } },
   clear: () => change(() => Object.assign(state, { plan: { rooms: [], things: [] }, chosen: null })),
 };
@@ -116,7 +132,7 @@ board.onkeydown = (event) => {
   if (event.key === 'r' || event.key === 'R') actions.turn();
   else if (event.key === 'Delete' || event.key === 'Backspace') actions.remove();
   else if (event.key === 'z' && (event.ctrlKey || event.metaKey)) actions.undo();
-  else if (by && state.chosen) change(() => { const one = about(state.chosen), key = one.box ? 'box' : 'at'; one[key] = one[key].map((part, k) => part + by[k % 2] * SNAP); });
+  else if (by && state.chosen) change(() => carry(about(state.chosen))(by.map((part) => part * SNAP)));
   else return;
   event.preventDefault();
 };
