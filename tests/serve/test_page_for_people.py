@@ -27,7 +27,7 @@ class Range(Panorama):
     def __init__(self, **options):
         super().__init__(**options)
         space, keys = spaces.MultiBinary(7), {code: [*value, 0.0] for code, value in self.spec.keys.items()}
-        event = spaces.Box(0, 1, (), np.bool_)
+        event = spaces.Box(0, 1, (), np.bool_)  # pyright: ignore[reportCallIssue, reportArgumentType]
         more = {"health": spaces.Box(0, 100, (), np.float32), "hit": event, "fallen": event}
         names = (*self.spec.action_names, "ATTACK")
         keys["Space"] = [0.0] * 6 + [1.0]

@@ -74,7 +74,10 @@ def opened(browser):
         page = contexts[-1].new_page()
         page.on("pageerror", lambda error: faults.append(str(error)))
         page.on("console", lambda message: faults.append(message.text) if "Content Security" in message.text else None)
-        page.on("request", lambda asked: None if asked.url.startswith(("blob:", url)) else faults.append(asked.url))
+        page.on(
+            "request",
+            lambda asked: None if asked.url.startswith(("blob:", url.partition("#")[0])) else faults.append(asked.url),
+        )
         page.goto(url)
         until(page, "!!window.terrella && terrella.idle")
         return page
@@ -112,8 +115,10 @@ def test_the_page_says_only_what_it_should(tmp_path):
     assert text.count("</script>") == 6 and "<title>a &lt;room&gt;" in text and "{{" not in text
 
 
-def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser):
-    page = opened(exported(tmp_path, 3000))
+@pytest.mark.parametrize("by", ["", "#webgl"], ids=["workers", "webgl"])
+def test_it_draws_what_the_rasteriser_draws(tmp_path, opened, browser, by):
+    page = opened(exported(tmp_path, 3000) + by)
+    assert page.evaluate("!!terrella.drawing.soft") == (not by)  # a test browser has no graphics card
     page.evaluate("terrella.stand([1.5, 2.0, 1.4], 0.7, 0)")
     until(page, "terrella.idle")
     shown, lens = page.evaluate("terrella.pixels()"), page.evaluate("terrella.lens()")
@@ -300,7 +305,7 @@ def test_fewer_gaussians_leave_no_surface_open(tmp_path, opened):
     words = "a small room with a pillar and a window"
     assert main(["space", "build", words, "--out", str(tmp_path / "w"), "--gaussians", "6000"]) == 0
     assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
-    page = opened((tmp_path / "place.html").as_uri())
+    page = opened((tmp_path / "place.html").as_uri() + "#webgl")
     whole = page.evaluate("terrella.drawing.count")
     ask = """most => new Promise((done) => { terrella.sorter.onOrder = done; terrella.sorter.ask({ ...terrella.sight(), most }); })
         .then(({ order, coarse, all }) => { terrella.drawing.order(order, coarse); return [order.length, coarse, all]; })"""

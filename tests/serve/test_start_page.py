@@ -84,7 +84,11 @@ class Drawer:
 @contextlib.contextmanager
 def started(token=None, shelf=None):
     listener, ready, address = open_port("127.0.0.1", 0), threading.Event(), []
-    begun = lambda url: (address.append(url), ready.set())  # noqa: E731
+
+    def begun(url: str) -> None:
+        address.append(url)
+        ready.set()
+
     server = make_server(
         StartPage(shelf or Drawer(), token=token), listener, "127.0.0.1", token, begun, websockets=True
     )

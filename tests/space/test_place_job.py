@@ -80,7 +80,7 @@ def test_a_failure_is_a_sentence_and_can_be_tried_again(tmp_path, making):
 def test_wrong_arguments_and_records_are_refused(tmp_path, making):
     for wrong in ({}, {"text": "a", "image": "b"}, {"sculpture": "a"}):
         with pytest.raises(TerrellaError, match="give one of text="):
-            terrella.start_place(tmp_path / "p", **wrong)
+            terrella.start_place(tmp_path / "p", **wrong)  # pyright: ignore[reportArgumentType]
     with pytest.raises(TerrellaError, match="start_place begins one"):
         terrella.resume_place(tmp_path / "p")
     for text in ("{", "[]", json.dumps({"state": "failed", "source": {}, "config": {}, "process": os.getpid()})):

@@ -33,10 +33,10 @@ def test_the_laws_hold():
 
 def test_it_is_an_environment():
     env = terrella.as_env(splat(), num_envs=2, seed=0, max_steps=3)
-    assert env.reset()[0].shape == (2, *SIZE, 3)
+    assert env.reset()[0].shape == (2, *SIZE, 3)  # pyright: ignore[reportAttributeAccessIssue]
     for _ in range(3):
         pictures, _, _, truncated, _ = env.step(env.action_space.sample())
-    assert truncated.all() and pictures.std() > 5
+    assert truncated.all() and pictures.std() > 5  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_one_walks_to_the_wall_flies_and_falls():
@@ -100,7 +100,9 @@ def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
             main(["space", "import", str(tmp_path / name), "--out", str(tmp_path / f"of {name}"), "--size", "24", "32"])
             == 0
         )
-        off = terrella.load(tmp_path / f"of {name}").gaussians.means - world.gaussians.means
+        again = terrella.load(tmp_path / f"of {name}")
+        assert isinstance(again, SplatWorld) and isinstance(world, SplatWorld)
+        off = again.gaussians.means - world.gaussians.means
         assert off.abs().max() < 1e-3
     (tmp_path / "bad.ply").write_bytes(b"ply\n")
     assert main(["space", "import", str(tmp_path / "bad.ply"), "--out", str(tmp_path / "b")]) == 2

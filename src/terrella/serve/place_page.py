@@ -30,7 +30,6 @@ from ..space.raster import Gaussians
 from ..space.raster.gaussians import Y0
 from ..space.solids import Solids
 from .http_server import WEB, application, posted, serve_page, starting_command
-from .place_frames import FrameRenderer
 from .place_scene import PlaceScene
 from .thing_page import PutThings, Spot, read_spot
 
@@ -72,22 +71,21 @@ class PlacePage:
         edits: Sequence[Edit],
         save: str = "",
         watch: str = "",
-        frames: str = "",
         more: Mapping[str, str] | None = None,
     ) -> bytes:
         """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
-        the address of newer states of a place that is being fitted, without editing; frames: the address that renders for browsers
-        that cannot; more: other addresses of a server: `things`, which builds what words name, and `files`, which writes files;
-        `key` goes with all that the page posts."""
+        the address of newer states of a place that is being fitted, without editing; more: other addresses of a server: `things`,
+        which builds what words name, `files`, which writes files, and `collider`, what stops walkers after edits; `key` goes with
+        all that the page posts."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
-            **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch, "frames": frames,
+            **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch,
             **(more or {}),
             "starts": place.starts[:MOST_STARTS].tolist(), "pace": list(place.pace), "keep": list(place.keep), "dt_s": place.dt_s,
             "boxes": _boxes(place), "edits": list(edits), "merged": [about for about, _ in merged],
             "objects": list(place.names), "samples": samples().tolist(), "beside": self._beside, "note": place.note,
             "closed": place.closed, "after": None if save or watch else self._collider_after(edits),
-            "command": starting_command() if save or watch or frames else "",
+            "command": starting_command() if save or watch else "",
         }  # fmt: skip
         parts = {
             "policy": self.policy, "title": html.escape(f"{place.name} · Terrella"), "style": self._style, "script": self._script,
@@ -257,11 +255,10 @@ class EditablePlace:
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; and /frame, which
-    draws for browsers that cannot."""
+    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; and /collider,
+    what stops walkers after edits."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
     writing = threading.Lock()  # one file at a time, while edits go on
-    frames = FrameRenderer(scene.gaussians, scene.objects, place.edits, scene.other)
 
     def save(content: bytes) -> None:
         posted_edits = _wished(place, content)
@@ -289,23 +286,17 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         with lock:
             return json.dumps(packed_collider(after(edits))).encode()
 
-    async def draw(request: Request) -> Response:
-        try:
-            return Response(await run_in_threadpool(frames.draw, request.query_params), media_type="image/jpeg")
-        except TerrellaError as error:
-            return PlainTextResponse(str(error), 422)
-
     offered = [
         ("edits", save, LONGEST_EDITS, "edits are lines of JSON"),
         ("things", build_things if place.put else None, LONGEST_WISH, "a thing has words and a spot"),
         ("files", write_file if place.export else None, LONGEST_WISH, "a file has a kind"),
         ("collider", close if scene.collider_after else None, LONGEST_EDITS, "edits are lines of JSON"),
     ]
-    routes = [Route("/frame", draw)] + [
+    routes = [
         Route(f"/{name}", _posting(work, most, form), methods=["POST"]) for name, work, most, form in offered if work
     ]
     more = {"key": place.key} | {name: f"/{name}" for name, work, *_ in offered[1:] if work}
-    html = lambda: page.html(place.edits(), "/edits", frames="/frame", more=more)  # noqa: E731
+    html = lambda: page.html(place.edits(), "/edits", more=more)  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
 
 

@@ -13,9 +13,9 @@ import { MiniMap } from './minimap.js';
 import { Orbit } from './orbit.js';
 import { spotAt } from './put.js';
 import { linkBack, reach } from './reach.js';
-import { Remote } from './remote.js';
 import { decoded, inflate, joined, Reader, unpackScene } from './scene.js';
 import { Solid } from './solid.js';
+import { drawsInSoftware, Soft } from './soft.js';
 import { Sorter } from './sort.js';
 import { Story } from './story.js';
 import { Walker } from './walk.js';
@@ -34,11 +34,12 @@ const ready = await open().catch((error) => {
 });
 
 async function open() {
-  const drawing = world.frames && !document.createElement('canvas').getContext('webgl2') ? new Remote(canvas, world.frames, world.command, toast) : new Drawing(canvas), { source, solid } = await unpacked(world, decoded($('data').textContent));
+  const soft = drawsInSoftware() && location.hash !== '#webgl', { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
   const story = new Story(source, [], source.length === world.count ? await others() : undefined);
   try { story.begin(source, world.edits); } catch (error) { if (source.length === world.count) throw error; }  // the rest comes
-  return { drawing, source, story, solid };
+  const drawingOn = (element) => (soft ? new Soft(element, () => seen.arrived?.()) : new Drawing(element));
+  return { drawing: drawingOn(canvas), drawingOn, source, story, solid };
 }
 
 /** What comes first of a place: Gaussians that are spread over all, and what is solid. */
@@ -67,7 +68,7 @@ async function whole(source) {
 
 if (ready) run(ready);
 
-function run({ drawing, source, story, solid: first }) {
+function run({ drawing, drawingOn, source, story, solid: first }) {
   let solid = first, made = '';
   const closed = new Map();  // what stops walkers after edits, by their lines
   const walker = new Walker(world), orbit = new Orbit(walker), map = new MiniMap($('minimap').querySelector('canvas'), source);
@@ -76,7 +77,7 @@ function run({ drawing, source, story, solid: first }) {
     moved: walks, tool: (name, event) => editor.open && editor.selecting.handle(name, event), look,
     key: (event) => editor.open && editor.gizmo.key(event), still: () => orbit.on, zoom: (factor) => { if (orbit.on) { orbit.zoom(factor); redraw(); } },
   });
-  const compare = new Compare(redraw);
+  const compare = new Compare(redraw, drawingOn);
   const editor = new Editor(story, drawing, {
     changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look,
     solid: () => solid, body: world.body, put: world.things, command: world.command, key: world.key,
@@ -89,8 +90,9 @@ function run({ drawing, source, story, solid: first }) {
   });
 
   /** The view as a picture, without lines: a blob of PNG. */
-  function picture() {
+  async function picture() {
     paint(false);
+    while (drawing.busy) await new Promise((done) => { setTimeout(done, 20); });
     const { width, height } = canvas, page = Object.assign(document.createElement('canvas'), { width, height }), context = page.getContext('2d');
     context.fillStyle = '#0b0c0f';
     context.fillRect(0, 0, width, height);
@@ -102,7 +104,7 @@ function run({ drawing, source, story, solid: first }) {
   /** A scene is drawn, and what is solid is read off it. */
   function take(scene) {
     drawing.set(scene, seen.stands);
-    sorter.set(scene);
+    if (!drawing.soft) sorter.set(scene);
     solid = scene === source ? first : scene.boxes ? new Boxes(scene.boxes) : closed.get(story.lines) ?? (world.closed ? first.edited(source, scene, world.samples) : Solid.of(scene, world.samples));
     if (scene !== source && story.edits.some(closes)) close(story.lines);
     Object.assign(map, { layer: null }, map.source === source ? {} : { source, own: null });
@@ -197,7 +199,7 @@ function run({ drawing, source, story, solid: first }) {
   function frame(time) {
     const passed = Math.min(Math.max(time - seen.last, 0), 200), moves = walker.pass(solid, hands.wish, passed / 1000);
     Object.assign(seen, { last: time, before: seen.last, dirty: seen.dirty || (seen.moves && !moves), moves });  // at rest it is drawn once more
-    if (moves && !drawing.remote) adapt(time - seen.before); else if (seen.share < 1 && !seen.dirty && !sorter.busy) Object.assign(seen, { share: Math.min(1, 3 * seen.share), dirty: true });
+    if (moves && !drawing.soft) adapt(time - seen.before); else if (seen.share < 1 && !seen.dirty && !sorter.busy) Object.assign(seen, { share: Math.min(1, 3 * seen.share), dirty: true });
     sort();
     if ((moves || seen.dirty) && drawing.ready && compare.ready) paint();  // till it is ordered, what is on the screen stays
     if (moves || seen.dirty || sorter.busy || compare.busy || seen.share < 1) requestAnimationFrame(frame); else { seen.running = false; figures(); }
@@ -212,14 +214,13 @@ function run({ drawing, source, story, solid: first }) {
 
   /** Has the Gaussians ordered for where the eye is, if it is elsewhere than for the last order. */
   function sort() {
-    if (drawing.remote) return;
     const eye = walker.eye, most = seen.share < 1 ? Math.max(FEWEST, seen.share * (seen.visible ?? 1e9)) : Infinity;
     const key = [...eye.place, eye.heading, eye.pitch, innerWidth, innerHeight, seen.share].map((part) => part.toFixed(3)).join();
     if (key === seen.sorted) return;
-    seen.sorted = key;
+    Object.assign(seen, { sorted: key, dirty: true });
+    if (drawing.soft) return;
     sorter.ask({ ...sight(), most });
     compare.ask({ ...sight(), most });
-    seen.dirty = true;
   }
 
   function sight() { return { eye: walker.eye.place, ...axes(walker.eye), ...lens(), near: NEAR, looks: [walker.eye.heading, walker.eye.pitch] }; }
@@ -227,26 +228,36 @@ function run({ drawing, source, story, solid: first }) {
   /** The eye, turned no farther than the last order reaches to the sides: beyond it nothing is drawn yet. */
   function shownEye() {
     const { place, heading, pitch } = walker.eye, near = (at, middle) => Math.max(middle - LEAD, Math.min(middle + LEAD, at));
-    if (!seen.looked || drawing.remote) return walker.eye;
+    if (!seen.looked) return walker.eye;
     const shown = [near(heading, seen.looked[0]), near(pitch, seen.looked[1])];
     return orbit.on ? orbit.eye(...shown) : { place, heading: shown[0], pitch: shown[1] };
   }
 
   function paint(lines = true) {
     const sharp = (devicePixelRatio || 1) * Math.max(COARSEST, seen.share), width = Math.round(innerWidth * sharp), height = Math.round(innerHeight * sharp);
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    if (!drawing.soft && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, { width, height });
     seen.dirty = false;
     drawing.clear();
     const eye = shownEye(), view = { ...matrices(eye, lens()), eye, lens: lens(), moves: seen.moves }, part = [0, 0, width, height];
     drawing.paint(view, part, lines ? [...editor.wires, ...film.wires] : []);
-    compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !editor.wires.length);
+    compare.paint(drawing, view, part, !seen.moves && seen.share === 1 && !sorter.busy && !compare.busy && !drawing.busy && !editor.wires.length);
     editor.gizmo.place();
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
     seen.painted += 1;
-    seen.times.push(performance.now());
-    if (seen.times.length > 240) seen.times.splice(0, 120);
+    if (!drawing.soft) shown();
     $('place').dataset.state = 'open';
   }
+
+  /** A picture came onto the screen. */
+  function shown() {
+    seen.times.push(performance.now());
+    if (seen.times.length > 240) seen.times.splice(0, 120);
+  }
+
+  seen.arrived = () => {
+    shown();
+    if (compare.open) redraw();
+  };
 
   function figures() {
     const since = performance.now() - 1500, times = seen.times.filter((time) => time > since);
@@ -263,7 +274,7 @@ function run({ drawing, source, story, solid: first }) {
   const full = () => (document.fullscreenElement ? document.exitFullscreen() : $('place').requestFullscreen?.());
   const filming = () => { if (editor.open && !film.open) editor.toggle(); film.toggle(); flip('filming', film.open); };
   const editing = () => { if (film.open) filming(); editor.toggle(); };
-  const putHere = () => { if (world.things && !drawing.remote) { if (!editor.open) editing(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
+  const putHere = () => { if (world.things) { if (!editor.open) editing(); editor.take('put'); editor.put.choose(); $('put-words').focus(); redraw(); } };
   const does = { home, fly, orbit: turnAround, edit: editing, filming, tint, compared: contrast, 'map-open': showMap, full };
   Object.entries(does).forEach(([id, act]) => { $(id).onclick = act; });
   const shortcuts = { KeyH: home, KeyF: fly, KeyO: turnAround, KeyN: putHere, KeyE: () => $('edit').hidden || editing(), KeyK: () => $('filming').hidden || film.add(), KeyX: () => $('filming').hidden || filming(), KeyT: () => $('tint').hidden || tint(), KeyB: () => $('compared').hidden || contrast(), KeyM: showMap, Escape: () => editor.choose(null), Delete: () => editor.open && editor.act({ do: 'delete' }) };
@@ -290,7 +301,7 @@ function run({ drawing, source, story, solid: first }) {
     story.others.set(merges.sha256, await beside());
     editor.change(() => story.add({ ...merges, by: [x, y, z], degrees }));
   };
-  offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
+  if (!drawing.soft) offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
 
   seen.stands = world.count / source.length;
   take(story.scene);
@@ -304,13 +315,9 @@ function run({ drawing, source, story, solid: first }) {
       story.others = await others();
       story.begin(source, world.edits);
       seen.stands = 1;
-      $('edit').hidden = !!drawing.remote;
+      $('edit').hidden = false;
       take(story.scene);
     }).catch((error) => toast(error.message));
-  }
-  if (drawing.remote) {
-    for (const id of ['edit', 'tint', 'compared', 'orbit', 'filming']) $(id).hidden = true;
-    toast(world.watch ? 'This browser has no WebGL2; watch the fit in another one.' : 'This browser has no WebGL2, so the server draws. You can walk; editing needs WebGL2.');
   }
   if (world.watch) {
     $('making').hidden = false;
@@ -321,10 +328,12 @@ function run({ drawing, source, story, solid: first }) {
   // the state of the page, for scripts
   window.terrella = {
     story, editor, film, map, drawing, walker, orbit, sorter, compare, lens, sight, get solid() { return solid; }, get painted() { return seen.painted; },
-    get idle() { return !seen.running && !seen.dirty && drawing.ready && compare.ready && seen.stands === 1; }, get eye() { return walker.eye; },
+    get idle() { return !seen.running && !seen.dirty && drawing.ready && !drawing.busy && compare.ready && !compare.busy && seen.stands === 1; }, get eye() { return walker.eye; },
     stand(place, heading, pitch = 0) { walker.set(place, heading, pitch, true); redraw(); },
-    pixels() {
+    async pixels() {
       paint();
+      while (drawing.busy) await new Promise((done) => { setTimeout(done, 20); });
+      if (drawing.soft) return { width: canvas.width, height: canvas.height, data: Array.from(drawing.read()) };
       const { gl } = drawing, { width, height } = canvas, data = new Uint8Array(4 * width * height);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
       return { width, height, data };

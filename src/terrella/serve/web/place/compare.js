@@ -1,13 +1,13 @@
 // Two places in one picture, from the same camera: the other one to the left of a line that can be dragged, the place to its right.
 
-import { Drawing } from './draw.js';
 import { Sorter } from './sort.js';
 
 const $ = (id) => document.getElementById(id), STEP = 0.02;
 
 export class Compare {
-  constructor(redraw) {
-    Object.assign(this, { redraw, open: false, at: 0.5, db: null, name: '' });
+  /** drawingOn(canvas): what draws on a canvas. */
+  constructor(redraw, drawingOn) {
+    Object.assign(this, { redraw, drawingOn, open: false, at: 0.5, db: null, name: '' });
     const line = $('wipe');
     line.onpointerdown = (event) => { line.setPointerCapture(event.pointerId); event.preventDefault(); };
     line.onpointermove = (event) => line.hasPointerCapture(event.pointerId) && this.wipe(event.clientX / innerWidth);
@@ -23,10 +23,10 @@ export class Compare {
     $('compare').hidden = !scene;
     $('compared').setAttribute('aria-pressed', this.open);
     if (scene) {
-      this.drawing ??= new Drawing($('other'));
-      this.sorter ??= new Sorter(({ order, coarse }) => { this.drawing.order(order, coarse); this.redraw(); });
+      this.drawing ??= this.drawingOn($('other'));
+      if (!this.drawing.soft) this.sorter ??= new Sorter(({ order, coarse }) => { this.drawing.order(order, coarse); this.redraw(); });
       this.drawing.set(scene, 1);
-      this.sorter.set(scene);
+      this.sorter?.set(scene);
       $('other-name').textContent = name;
       this.wipe(this.at);
     }
@@ -43,7 +43,7 @@ export class Compare {
 
   get ready() { return !this.open || this.drawing.ready; }
 
-  get busy() { return this.open && this.sorter.busy; }
+  get busy() { return this.open && !!(this.sorter ?? this.drawing).busy; }
 
   ask(view) { if (this.open) this.sorter.ask(view); }
 
@@ -51,17 +51,18 @@ export class Compare {
   paint(ours, view, part, rests) {
     if (!this.open) return;
     const canvas = $('other'), [, , width, height] = part;
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+    if (!ours.soft && (canvas.width !== width || canvas.height !== height)) Object.assign(canvas, { width, height });
     Object.assign(this.drawing, { tint: ours.tint, stops: ours.stops });
     this.drawing.clear();
     this.drawing.paint(view, part);
-    this.db = rests ? decibels(read(ours, part), read(this.drawing, part)) : null;
+    this.db = rests && !this.busy ? decibels(read(ours, part), read(this.drawing, part)) : null;
     $('compare-db').textContent = this.db === null ? '–' : this.db === Infinity ? 'the same' : `${this.db.toFixed(1)} dB`;
   }
 }
 
-function read({ gl }, [x, y, width, height]) {
-  const data = new Uint8Array(4 * width * height);
+function read(drawing, [x, y, width, height]) {
+  if (drawing.soft) return drawing.read();
+  const { gl } = drawing, data = new Uint8Array(4 * width * height);
   gl.readPixels(x, y, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
   return data;
 }

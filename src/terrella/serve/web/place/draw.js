@@ -12,7 +12,7 @@ export const NEAR = 0.05;
 export class Drawing {
   constructor(canvas) {
     const gl = canvas.getContext('webgl2', { antialias: false, premultipliedAlpha: true });
-    if (!gl) throw new Error('this browser draws no WebGL2; open the place with `terrella space view`, which then draws on its own machine.');
+    if (!gl) throw new Error('this browser draws no WebGL2; take #webgl off the address.');
     Object.assign(this, { canvas, gl, ready: false, count: 0, coarse: 0, stands: 1, tint: 0, stops: 0, still: { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 } });
     this.preview = this.still;
     this.splats = program(gl, SPLAT_SHADERS);
@@ -195,7 +195,7 @@ export function axesOf({ quats, scales }, k) {
 }
 
 /** xx, xy, xz, yy, yz, zz. */
-function covariance(scene, k) {
+export function covariance(scene, k) {
   const m = axesOf(scene, k), sum = (i, j) => m[i] * m[j] + m[i + 3] * m[j + 3] + m[i + 6] * m[j + 6];
   return [sum(0, 0), sum(0, 1), sum(0, 2), sum(1, 1), sum(1, 2), sum(2, 2)];
 }

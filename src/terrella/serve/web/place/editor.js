@@ -68,7 +68,7 @@ export class Editor {
 
   /** The handles around what is selected. */
   hold() {
-    this.gizmo.around(this.open && this.mask && !this.drawing.remote && !('all' in this.chosen || 'plane' in this.chosen) ? endsOf(this.story.scene, this.mask) : null);
+    this.gizmo.around(this.open && this.mask && !('all' in this.chosen || 'plane' in this.chosen) ? endsOf(this.story.scene, this.mask) : null);
   }
 
   take(tool) {
