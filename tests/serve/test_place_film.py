@@ -149,9 +149,9 @@ def test_one_begins_as_the_picture_was_taken(tmp_path, opened, serving):  # noqa
 
 def test_exposure_is_a_factor_of_all_pictures(folder, opened, serving, tmp_path):  # noqa: F811
     assert main(["space", "export", str(folder), str(tmp_path / "place.html")]) == 0
-    page = opened((tmp_path / "place.html").as_uri())
+    page = opened((tmp_path / "place.html").as_uri() + "#webgl")  # workers draw the ground beneath, too
     offered = "[...document.querySelectorAll('[data-file]:not([hidden])')].map((one) => one.dataset.file)"
     assert page.evaluate(offered) == ["png"]
-    pixels = "(stops) => { terrella.drawing.stops = stops; return terrella.pixels().data; }"
+    pixels = "(stops) => { terrella.drawing.stops = stops; return terrella.pixels().then(({ data }) => data); }"
     plain, dark = (np.array(page.evaluate(pixels, stops), float).reshape(-1, 4)[:, :3] for stops in (0, -1))
     assert np.abs(dark - plain * 2 ** (-1 / 2.2)).max() <= 1.01
