@@ -333,7 +333,7 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
     async pixels() {
       paint();
       while (drawing.busy) await new Promise((done) => { setTimeout(done, 20); });
-      if (drawing.soft) return { width: canvas.width, height: canvas.height, data: Array.from(drawing.read()) };
+      if (drawing.soft) return { width: canvas.width, height: canvas.height, data: drawing.read() };
       const { gl } = drawing, { width, height } = canvas, data = new Uint8Array(4 * width * height);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, data);
       return { width, height, data };
