@@ -20,7 +20,6 @@ from pathlib import Path
 import torch
 
 import terrella
-from terrella import progress
 from terrella.data import ClipCache
 from terrella.measure import (
     CLIPS,
@@ -37,7 +36,6 @@ from terrella.measure import (
     verdict,
     write_report,
 )
-from terrella.space.keyframes import merge
 from terrella.worlds.generator import encode_depth
 
 CONTEXT, HORIZONS = 10, (1, 8, 32, 64)
@@ -93,7 +91,7 @@ class Average(torch.nn.Module):
 
     def forward(self, noisy, time, conditioning):
         glimpse, last = conditioning.glimpse, conditioning.last
-        rgb = torch.where(last[:, 3:] > 0, last[:, :3], merge(glimpse))
+        rgb = torch.where(last[:, 3:] > 0, last[:, :3], glimpse.merged)
         return torch.cat([rgb * 2 - 1, encode_depth(glimpse.depth)[:, None]], 1)
 
 
@@ -142,6 +140,10 @@ def bars(card: Scorecard) -> Iterator[Bar]:
         yield Bar(f"{what}, standing still for 1,000 steps", still, 1 - within, 1 + within)
 
 
+def said(share: float, words: str, left_s: float) -> None:
+    print(f"{share:.0%} {words}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data")
@@ -159,9 +161,7 @@ def main() -> None:
     }
     closing = {"last frame only": bare.with_memory_budget(0)}
     exam = Exam(arms, sets, ExamConfig(horizons=HORIZONS), album=Album.of_cache(cache), closing=closing)
-    with progress.shown("scoring") as report:
-        tell = lambda share, words, left_s: report(share, 1, words, left_s)  # noqa: E731
-        card = examine(exam, given.out / "parts", f"{given.world} {cache.path}", tell)
+    card = examine(exam, given.out / "parts", f"{given.world} {cache.path}", said)
     print(*verdict(card), sep="\n")
     print(*write_report(card, given.out, "doom-maze: the scorecard"))
     targets = []
