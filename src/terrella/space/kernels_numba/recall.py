@@ -130,7 +130,7 @@ def covered(first, last, coarse, depth, turns, poses, rows, dreamt, camera, ever
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def recall(first, last, picks, shared, own, seen, turns, positions, camera, colours, trust):
-    """The kernel of keyframes.recall_slowly: picks [B, S] (-1: none) among shared and own = rgb uint8 [K, 3, H, W] (`own`:
+    """The kernel of keyframes.look_slowly: picks [B, S] (-1: none) among shared and own = rgb uint8 [K, 3, H, W] (`own`:
     doubled), depth [K, h, w], turn [K, 3, 3], pose [K, 7]; depth in the views [B, V, U], their turns and positions; fills colours
     [B, slots, 3, V, U] and trust [B, slots, V, U], which are 0."""
     rgb, depth, key_turns, poses = shared
