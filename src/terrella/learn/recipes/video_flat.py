@@ -39,8 +39,8 @@ FLOW_ROLLOUT = 8  # steps of a clip that a flow network predicts
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE, MAX_STRESS = (
     0.4,
-    16.0,
-)  # pixels that change are weighted up to this share of the loss, at most by this factor
+    128.0,
+)  # the pixels that change weigh this share of all others, but none more than so much
 
 
 @dataclass(frozen=True)
