@@ -173,7 +173,7 @@ def test_facts_are_computed_once(tmp_path):
 
 
 def test_other_settings_and_foreign_files_are_refused(whole, tmp_path):
-    with pytest.raises(TrainingError, match=r"other settings \(rate 0.1, not 0.2"):
+    with pytest.raises(TrainingError, match=r"other settings \(rate 0.1, not 0.2\); repeat them, or give another"):
         trainer_in(whole, rate=0.2)
     assert trainer_in(whole, hours=1.0, save_every_s=5.0).finished, "hours and saves may change"
     with pytest.raises(TrainingError, match="--seed is 0 or more; got -1"):
@@ -191,7 +191,7 @@ def test_a_run_goes_on_with_a_setting_that_is_newer_than_it_at_its_default_alone
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     assert Trainer(Run.of(out, Newer(), quiet, free=("hours",)), "toy", Walk(), Toy(), STEPS).finished
-    with pytest.raises(TrainingError, match="other settings .way None, not new"):
+    with pytest.raises(TrainingError, match=r"settings \(way None, not new\); give another --out"):
         Trainer(Run.of(out, Newer(way="new"), quiet, free=("hours",)), "toy", Walk(), Toy(), STEPS)
 
 
@@ -281,6 +281,10 @@ class Fed(Walk):
 LACKS = [
     torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
     RuntimeError("CUDA error: out of memory"),
+    RuntimeError("CUDA driver error: out of memory"),
+    RuntimeError("Triton Error [CUDA]: out of memory"),
+    RuntimeError("MPS backend out of memory (MPS allocated: 8 GiB, other allocations: 1 GiB, max allowed: 9 GiB)."),
+    RuntimeError("unable to mmap 4096 bytes from file </torch_1>: Cannot allocate memory (12)"),
     RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
     RuntimeError("CUDA error: CUBLAS_STATUS_NOT_INITIALIZED when calling `cublasCreate(handle)`"),
     RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"),

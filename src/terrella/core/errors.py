@@ -1,7 +1,7 @@
 """The errors that Terrella raises on purpose. Each message is one sentence: what is wrong, and what to do."""
 
-_OUT_OF_MEMORY = (  # as PyTorch and the libraries of CUDA say it; a library that finds no room for itself is not initialised
-    "CUDA out of memory", "CUDA error: out of memory", "can't allocate memory", "not enough memory", "ALLOC_FAILED",
+_OUT_OF_MEMORY = (  # as PyTorch, Triton and CUDA say it; a library without room for itself is not initialised
+    "out of memory", "can't allocate memory", "Cannot allocate memory", "not enough memory", "ALLOC_FAILED",
     "ALLOCATION_FAILED", "CUBLAS_STATUS_NOT_INITIALIZED", "CUDNN_STATUS_NOT_INITIALIZED",
 )  # fmt: skip
 

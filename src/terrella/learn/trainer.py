@@ -106,8 +106,10 @@ class Run:
             f"{name} {old.get(name)}, not {recipe.get(name)}" for name in both if recipe.get(name) != old.get(name)
         ]
         if other:
+            unknown = any(name not in old for name in both)  # of an earlier release, which no command repeats
             raise TrainingError(
-                f"{self.out} holds a run with other settings ({'; '.join(other)}); repeat them, or give another --out."
+                f"{self.out} holds a run with other settings ({'; '.join(other)}); "
+                f"{'' if unknown else 'repeat them, or '}give another --out."
             )
         return saved
 
