@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import threading
@@ -34,6 +35,14 @@ def making(monkeypatch):
 
 def record(out):
     return out.with_name(out.name + ".job.json")
+
+
+def test_a_job_begins_while_another_program_polls_it(tmp_path, making):
+    making["go"].set()
+    with open(tmp_path / "p.job.lock", "w") as polled:
+        fcntl.flock(polled, fcntl.LOCK_SH)
+        threading.Timer(0.1, fcntl.flock, (polled, fcntl.LOCK_UN)).start()
+        assert terrella.start_place(tmp_path / "p", text="a room").wait(20).facts
 
 
 def test_a_job_is_polled_and_its_result_awaited(tmp_path, making):

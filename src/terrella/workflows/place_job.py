@@ -145,14 +145,13 @@ def _hold(out: Path) -> IO[str]:
     """The lock of a job, held until it is closed or the process ends. TerrellaError where another one holds it."""
     out.parent.mkdir(parents=True, exist_ok=True)
     handle = _lock_of(out).open("a")
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        handle.close()
-        _check_idle(out)
-        raise
-    os.set_inheritable(handle.fileno(), False)
-    return handle
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return handle
+        except BlockingIOError:
+            _check_idle(out)
+            time.sleep(0.01)  # it is only being polled
 
 
 def _is_held(out: Path) -> bool:
