@@ -397,6 +397,10 @@ def test_a_policy_of_other_actions_or_channels_is_refused(fetch):
         ImitationActor.load(facts["policy"], replace(world.spec, channels=silent))
     with pytest.raises(DatasetError, match="cannot see 'depth'"):
         train_imitation(recording, "unused", replace(QUICK, sees=("depth",)), Imitation(), quiet)
+    with pytest.raises(DatasetError, match="did you mean 'grid'. It has grid, wind"):
+        train_imitation(recording, "unused", replace(QUICK, sees=("gird",)), Imitation(), quiet)
+    with pytest.raises(TrainingError, match="--device moon"):  # before a recording is read
+        train_imitation("nowhere", "unused", QUICK, Imitation(), quiet, "moon")
     with pytest.raises(TrainingError, match="at most the 1 actions"):
         train_imitation(recording, "unused", QUICK, Imitation(execute=2), quiet)
 

@@ -17,6 +17,7 @@ from ...act.imitation import ImitationActor
 from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork, is_picture
 from ...act.sentences import vocabulary_of
 from ...core.errors import DatasetError, TrainingError
+from ...core.similar import did_you_mean
 from ...core.spec import Spec, kind_of
 from ...data import Dataset
 from ...data.channels import ESTIMATES
@@ -84,14 +85,14 @@ def train_imitation(
     verdict on held-out episodes. relabel: which rows are learned from, with what actions; default: a recorded teacher's (channel
     `expert`), else those that were taken. spec: where it is to act. DatasetError or TrainingError for what cannot be imitated,
     ActionError or ChannelError if it could not act there."""
-    out, batch = Path(out), practice.batch or 256
+    out, batch, place = Path(out), practice.batch or 256, device_named(device)
     _check(practice, imitation)
     opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
     config = config_of(opened, sees, practice.hidden, imitation)
     if spec is not None:
         config.check(spec)
     settings = {**asdict(imitation), "recording": str(recording)}
-    run = Run.of(out, practice, report, device_named(device), ("minutes",), **settings)
+    run = Run.of(out, practice, report, place, ("minutes",), **settings)
     run.saved_facts(STAGE)
     torch.manual_seed(practice.seed)
     network = ImitationNetwork(config).to(run.device)
@@ -135,8 +136,11 @@ def open_demonstrations(
         sees = tuple(name for name in usual if len(_shape(opened, name) or ()) in (0, 1, 3))
     for name in sees:
         if name in NOT_SEEN - NAMED_ONLY or _shape(opened, name) is None:
-            known = ", ".join(name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN)
-            raise DatasetError(f"a policy cannot see '{name}' of {opened.name}; it has {known or 'nothing to see'}.")
+            known = [name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN]
+            hint = did_you_mean(name, known) or "."
+            raise DatasetError(
+                f"a policy cannot see '{name}' of {opened.name}{hint} It has {', '.join(known) or 'nothing to see'}."
+            )
     if not sees:
         raise DatasetError(f"{opened.name} has neither pictures nor numbers that a policy could see.")
     return opened.having(name for name in sees), tuple(sees)
