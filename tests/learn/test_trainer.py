@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import signal
+import time
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -253,6 +254,24 @@ def test_a_device_that_is_asked_now_and_then_never_saves_what_is_not_a_number(st
     saved, facts = load_file(tmp_path / "resume-toy.safetensors"), saved_facts(tmp_path, "toy")
     assert all(part.isfinite().all() for part in saved.values()) and facts["float32"]
     assert facts["step"] == (0 if stopped else STEPS), "from the last save, which was before the first step"
+
+
+def test_what_is_not_a_number_in_the_last_seconds_is_learned_again(tmp_path, monkeypatch):
+    class Overflows(Toy):
+        def losses(self, batch, now):
+            time.sleep(0.01)
+            with now.half():
+                yield from super().losses(batch if now.precise else batch * float("nan"), now)
+
+    for place in (train_step, module):
+        monkeypatch.setattr(place, "half_is_native", lambda device: True)
+    monkeypatch.setattr(train_step, "half_precision", lambda device: nullcontext())
+    monkeypatch.setattr(Trainer, "_waits", False)
+    trainer = trainer_in(tmp_path, 10**6, objective=Overflows())
+    trainer.limit_s = 0.1
+    with pytest.warns(UserWarning, match="training goes on in float32 from step 0"):
+        trainer.train()
+    assert trainer.finished and trainer.facts["step"] > 1 and trainer.facts["float32"]
 
 
 def test_a_weight_that_is_not_a_number_is_not_saved(tmp_path):

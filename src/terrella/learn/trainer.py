@@ -201,6 +201,9 @@ class Trainer:
                 continue
             now = time.monotonic()
             facts["seconds"] = before + now - began
+            if self.finished and not self._settled():
+                began = now - facts["seconds"] + before  # the time since the last save is taken again
+                continue
             if len(facts["recent"]) == LOG_EVERY or self.finished:
                 self._log((self.steps_done - first) / max(now - began, 1e-9))
             if now - saved > run.save_every_s and self._settled():
