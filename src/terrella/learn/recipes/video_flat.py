@@ -37,10 +37,8 @@ PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are search
 QUARTER = 0.25
 FLOW_ROLLOUT = 8  # steps of a clip that a flow network predicts
 REMEMBERED = 64  # steps before a start from which its mosaic is made
-CHANGED_SHARE, MAX_STRESS = (
-    0.4,
-    128.0,
-)  # the pixels that change weigh this share of all others, but none more than so much
+CHANGED_SHARE = 0.4  # the pixels that change weigh this share of all others in the loss,
+MAX_STRESS = 128.0  # but none of them more than so much
 
 
 @dataclass(frozen=True)
@@ -194,7 +192,7 @@ def _scrolling_of(parts: VideoParts) -> Scrolling:
 
 def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
     """The weight of pixels that change, apart from the scroll of the whole picture, in the loss of a flow network: such that they
-    are up to CHANGED_SHARE of it."""
+    weigh up to CHANGED_SHARE of all others."""
     rows = recording.rows_within(1, 0)
     rows = np.random.default_rng(seed).choice(rows, min(len(rows), 1000), replace=False)
     before, after = recording.rgb(rows - 1), recording.rgb(rows)
