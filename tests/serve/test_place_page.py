@@ -477,6 +477,12 @@ def test_a_place_is_merged_on_the_page_with_the_one_beside_it(tmp_path, opened, 
     page.evaluate("document.getElementById('undo').click()")
     for label, value in (("x", "4"), ("y", "-1.5"), ("degrees", "90")):
         page.locator(f"#merging input[aria-label={label}]").fill(value)
+    page.evaluate("terrella.editor.choose({ box: [-1, -1, -1, 9, 3.5, 3] }); terrella.editor.act({ do: 'delete' })")
+    page.click("#merge")
+    until(page, "terrella.idle && terrella.story.edits.length === 2")
+    assert page.evaluate("terrella.story.scene.length") < 1500  # fewer than before, with what was merged
+    assert page.evaluate("terrella.map.box.scale") < 0.8 * near
+    page.evaluate("document.getElementById('undo').click(); document.getElementById('undo').click()")
     page.click("#merge")
     until(page, "terrella.story.scene.length === 2100 && terrella.idle")
     assert page.evaluate("terrella.map.box.scale") < 0.8 * near  # the map shows what was merged

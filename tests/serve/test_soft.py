@@ -11,6 +11,8 @@ from .test_place_page import opened, until, world  # noqa: F401  (fixtures)
 
 WITHOUT = """const real = HTMLCanvasElement.prototype.getContext;
 HTMLCanvasElement.prototype.getContext = function (kind) { return kind === 'webgl2' ? null : real.call(this, kind); };"""
+FAILING = """const Real = Worker;
+Worker = class extends Real { postMessage(data, ...more) { super.postMessage(data.width === 33 ? { id: 1 } : data, ...more); } };"""
 SOME = "terrella.pixels().then(({ data }) => data.filter((_, k) => (k >> 2) % 17 === 0))"  # every 17th pixel: all take long to send
 CHANGES = (
     "drawing.tint = 1",
@@ -60,3 +62,40 @@ def test_without_webgl_one_walks_and_edits(tmp_path, browser):
         < 20
     )
     page.close()
+
+
+def test_without_workers_the_page_says_so(tmp_path, browser):
+    save_splat(world(300), tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    for by in ("", "#webgl"):
+        page = browser.new_page()
+        page.add_init_script("delete window.Worker")
+        page.goto((tmp_path / "place.html").as_uri() + by)
+        until(page, "document.getElementById('place').dataset.state === 'failed'")
+        assert page.inner_text("#banner") == "This browser runs no web workers; open the place in a newer one."
+        page.close()
+
+
+def test_a_worker_that_fails_is_said_and_the_next_view_is_drawn(tmp_path, browser):
+    save_splat(world(300), tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page = browser.new_page(viewport={"width": 32, "height": 24})
+    page.add_init_script(FAILING)
+    page.goto((tmp_path / "place.html").as_uri())
+    until(page, "!!window.terrella && terrella.idle")
+    page.set_viewport_size({"width": 33, "height": 24})
+    until(page, "document.getElementById('toast').textContent.includes('could not draw')")
+    until(page, "terrella.idle")
+    page.set_viewport_size({"width": 40, "height": 24})
+    until(page, "terrella.idle && document.getElementById('view').width === 40")
+    page.close()
+
+
+def test_pictures_on_the_way_grow_coarser_again(tmp_path, opened):  # noqa: F811
+    save_splat(world(300), tmp_path / "w")
+    assert main(["space", "export", str(tmp_path / "w"), str(tmp_path / "place.html")]) == 0
+    page = opened((tmp_path / "place.html").as_uri())
+    page.evaluate("Object.assign(terrella.drawing, { share: 1, ms: 1000 })")
+    page.keyboard.down("KeyW")
+    until(page, "terrella.drawing.share < 1")
+    page.keyboard.up("KeyW")

@@ -34,11 +34,12 @@ const ready = await open().catch((error) => {
 });
 
 async function open() {
+  if (!window.Worker) throw new Error('this browser runs no web workers; open the place in a newer one.');
   const soft = drawsInSoftware() && location.hash !== '#webgl', { source, solid } = await unpacked(world, decoded($('data').textContent));
   $('data').remove();
   const story = new Story(source, [], source.length === world.count ? await others() : undefined);
   try { story.begin(source, world.edits); } catch (error) { if (source.length === world.count) throw error; }  // the rest comes
-  const drawingOn = (element) => (soft ? new Soft(element, () => seen.arrived?.()) : new Drawing(element));
+  const drawingOn = (element) => (soft ? new Soft(element, () => seen.arrived?.(), () => toast('this browser could not draw the place: close other tabs and reload the page.')) : new Drawing(element));
   return { drawing: drawingOn(canvas), drawingOn, source, story, solid };
 }
 
@@ -63,7 +64,7 @@ async function whole(source) {
   while (!$('end') || !seen.painted) await new Promise((done) => { setTimeout(done, 50); });
   const rest = unpackScene(new Reader(await inflate(decoded($('rest').textContent))), { count: world.count - source.length });
   $('rest').remove();
-  return joined(source, rest);
+  return Object.assign(joined(source, rest), { before: world.count });
 }
 
 if (ready) run(ready);
@@ -92,7 +93,10 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   /** The view as a picture, without lines: a blob of PNG. */
   async function picture() {
     paint(false);
-    while (drawing.busy) await new Promise((done) => { setTimeout(done, 20); });
+    while (drawing.busy) {
+      await new Promise((done) => { setTimeout(done, 20); });
+      paint(false);  // a frame in between was drawn with lines
+    }
     const { width, height } = canvas, page = Object.assign(document.createElement('canvas'), { width, height }), context = page.getContext('2d');
     context.fillStyle = '#0b0c0f';
     context.fillRect(0, 0, width, height);

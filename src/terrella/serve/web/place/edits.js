@@ -57,6 +57,7 @@ export function edited(scene, edit, others) {
   if (edit.do === 'duplicate') {
     const many = scene.length, both = scene.at([...numbers(mask, -1), ...numbers(mask, 1)]);
     const fresh = highest(scene.objects) + 1, [dx, dy, dz] = single(by);
+    both.before = scene.before;
     for (let k = many; k < both.length; k += 1) {
       both.seen[k] = 0;
       both.objects[k] = fresh;

@@ -19,7 +19,7 @@ export class MiniMap {
   ends(scene) {
     const { boxes, length } = this.source;
     this.own ??= boxes ? [0, 1].flatMap((a) => [Math.min(...boxes.map((one) => one[a])), Math.max(...boxes.map((one) => one[3 + a]))]) : middle(this.source, 0, length) ?? [0, 1, 0, 1];  // windows show what lies beyond walls
-    const more = middle(scene, length, scene.length) ?? this.own;
+    const more = middle(scene, scene.before, scene.length) ?? this.own;
     return this.own.map((end, k) => (k % 2 ? Math.max(end, more[k]) + 0.3 : Math.min(end, more[k]) - 0.3));
   }
 

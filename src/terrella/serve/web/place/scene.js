@@ -4,17 +4,18 @@ const UNPACKED = { means: 3, quats: 4, scales: 3, colours: 3, opacities: 1 };
 
 /**
  * N Gaussians: means, quats (w x y z), scales, colours and opacities as float32, metres; seen 1 or 0, objects: numbers, 0 for none and -k
- * for what is hidden beneath k, whose names 1, 2, ... `names` lists; boxes, as boxes.js has them, where they are what stops bodies, else null.
+ * for what is hidden beneath k, whose names 1, 2, ... `names` lists; boxes, as boxes.js has them, where they are what stops bodies, else null;
+ * before: how many of them, the first ones, were there before all edits.
  */
 export class Scene {
-  constructor(columns, names = [], boxes = null) {
-    Object.assign(this, columns, { names, boxes });
+  constructor(columns, names = [], boxes = null, before = columns.opacities.length) {
+    Object.assign(this, columns, { names, boxes, before });
     this.length = this.opacities.length;
   }
 
   /** Its columns copied, for an edit to write into. */
   copy() {
-    return new Scene(Object.fromEntries(Scene.columns.map((name) => [name, this[name].slice()])), this.names);
+    return new Scene(Object.fromEntries(Scene.columns.map((name) => [name, this[name].slice()])), this.names, null, this.before);
   }
 
   /** Those whose numbers `keep` lists, in its order; a number may come twice. */
@@ -25,7 +26,7 @@ export class Scene {
       for (let at = 0; at < keep.length; at += 1) for (let part = 0; part < wide; part += 1) to[at * wide + part] = from[keep[at] * wide + part];
       columns[name] = to;
     }
-    return new Scene(columns, this.names);
+    return new Scene(columns, this.names, null, keep.reduce((sum, k) => sum + (k < this.before), 0));
   }
 }
 Scene.columns = [...Object.keys(UNPACKED), 'seen', 'objects'];
@@ -37,7 +38,7 @@ export function joined(one, other) {
     both.set(one[name]);
     both.set(other[name], one[name].length);
     return [name, both];
-  })), one.names, one.boxes);
+  })), one.names, one.boxes, one.before);
 }
 
 /** base64 as bytes. */

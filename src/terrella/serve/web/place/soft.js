@@ -9,7 +9,7 @@ const WORKERS = 2, FAST_MS = 60, SLOW_MS = 85, COARSEST = 0.2, PAST = 3, FAINT =
 function rastering() {
   const BINS = 65536, BLOCK = 4, SPENT = 1 / 255, STEPS = 256, MOST = 5.6, GROUND = [11, 12, 15];
   const falls = Float32Array.from({ length: STEPS * MOST + 2 }, (_, k) => Math.exp(-(k + 0.5) / STEPS)), bins = new Uint32Array(BINS + 1);
-  let rows = new Float32Array(0), depth = null, near = null, order = null, paint = null, left = null;
+  let rows = new Float32Array(0), depth = null, near = null, order = null, paint = null;
 
   /** Which Gaussians lie before the eye and within its view, nearest first, in `order`; returns their number. */
   function sorted({ view: m, projection, preview }, moved) {
@@ -40,8 +40,8 @@ function rastering() {
     const c = preview.factor * Math.cos(preview.turn), s = preview.factor * Math.sin(preview.turn), [mx, my, mz] = preview.middle, [ox, oy, oz] = preview.move;
     const moved = (x, y, z) => [c * (x - mx) - s * (y - my) + mx + ox, s * (x - mx) + c * (y - my) + my + oy, preview.factor * (z - mz) + mz + oz];
     const many = sorted(asked, moved), blocks = Math.ceil(width / (1 << BLOCK)), total = width * height;
-    if (!paint || paint.length !== 4 * total) [paint, left] = [new Float32Array(4 * total), new Int32Array(blocks * Math.ceil(height / (1 << BLOCK)))];
-    left.fill(0);
+    if (paint?.length !== 4 * total) paint = new Float32Array(4 * total);
+    const left = new Int32Array(blocks * Math.ceil(height / (1 << BLOCK)));  // how many pixels of each block something shows through
     for (let y = 0; y < height; y += 1) for (let x = 0; x < blocks; x += 1) left[(y >> BLOCK) * blocks + x] += Math.min(1 << BLOCK, width - (x << BLOCK));
     /** Whether something shows through in a part of the picture. */
     const open = (x0, x1, y0, y1) => {
@@ -116,14 +116,15 @@ function rastering() {
 }
 
 export class Soft {
-  /** arrived(): a picture is there. */
-  constructor(canvas, arrived) {
+  /** arrived(): a picture is there; failed(): a worker could not draw one. */
+  constructor(canvas, arrived, failed) {
     const program = URL.createObjectURL(new Blob([`(${rastering})()`], { type: 'text/javascript' })), still = { middle: [0, 0, 0], move: [0, 0, 0], turn: 0, factor: 1 };
-    Object.assign(this, { canvas, arrived, context: canvas.getContext('2d', { alpha: false }), soft: true, count: 0, stands: 1, tint: 0, stops: 0, still, preview: still });
-    Object.assign(this, { share: 0.5, ms: FAST_MS, id: 0, shown: 0, asked: '', next: null, whole: 1, picture: null, wires: [], view: null, version: 0 });
+    Object.assign(this, { canvas, arrived, failed, context: canvas.getContext('2d', { alpha: false }), soft: true, count: 0, stands: 1, tint: 0, stops: 0, still, preview: still });
+    Object.assign(this, { share: 0.5, ms: FAST_MS, id: 0, shown: 0, asked: '', next: null, picture: null, wires: [], view: null, version: 0 });
     this.workers = Array.from({ length: WORKERS }, () => {
       const one = { worker: new Worker(program), free: true };
       one.worker.onmessage = ({ data }) => this.take(one, data);
+      one.worker.onerror = () => this.lose(one);
       return one;
     });
   }
@@ -141,7 +142,7 @@ export class Soft {
       rows.set(means.subarray(3 * k, 3 * k + 3), at);
       rows.set(spread, at + 3);
       rows.set(colours.subarray(3 * k, 3 * k + 3), at + 9);
-      rows.set([opacities[k], Math.log(255 * opacities[k]), 3.34 * Math.sqrt(spread[0] + spread[3] + spread[5])], at + 12);
+      rows.set([opacities[k], Math.log(255 * opacities[k]), 3.34 * Math.sqrt(stands * (spread[0] + spread[3] + spread[5]))], at + 12);
     }
     this.workers.forEach(({ worker }) => worker.postMessage({ rows }));
     Object.assign(this, { stands, count: scene.length });
@@ -158,9 +159,9 @@ export class Soft {
 
   /** Asks for a view, coarser while the eye `moves`; of several that are wished for while the workers draw, the last is drawn. */
   paint({ view, projection, moves }, [, , width, height], wires = []) {
-    const share = moves ? this.share : 1, wish = { view, projection, width: Math.round(share * width), height: Math.round(share * height), tint: this.tint, gain: 2 ** (this.stops / 2.2), stands: this.stands, preview: this.preview, cut: moves ? FAINT : WHOLE };
+    const share = moves ? this.share : 1, wish = { view, projection, width: Math.round(share * width), height: Math.round(share * height), tint: this.tint, gain: 2 ** (this.stops / 2.2), stands: this.stands, preview: this.preview, moves, cut: moves ? FAINT : WHOLE };
     const asked = JSON.stringify([wish, this.version]);
-    Object.assign(this, { wires, whole: width });
+    this.wires = wires;
     if (asked === this.asked) { this.present(); return; }
     Object.assign(this, { asked, next: wish });
     this.send();
@@ -169,9 +170,8 @@ export class Soft {
   send() {
     const one = this.workers.find(({ free }) => free);
     if (!one || !this.next) return;
-    one.free = false;
-    one.view = this.next;
-    one.worker.postMessage({ ...this.next, id: ++this.id });
+    Object.assign(one, { free: false, view: this.next, id: ++this.id });
+    one.worker.postMessage({ ...this.next, id: one.id });
     this.next = null;
   }
 
@@ -179,10 +179,18 @@ export class Soft {
     one.free = true;
     this.send();
     if (id < this.shown) return;  // one that was asked later came first
-    if (width < this.whole) this.adapt(ms);
+    if (one.view.moves) this.adapt(ms);
     Object.assign(this, { shown: id, view: one.view, picture: new ImageData(pixels, width, height) });
     this.present();
     this.arrived();
+  }
+
+  /** A worker had an error, of too little memory perhaps: what is shown stays, and the next view is tried. */
+  lose(one) {
+    one.free = true;
+    Object.assign(this, { shown: Math.max(this.shown, one.id ?? 0), asked: '' });
+    this.failed();
+    this.send();
   }
 
   /** The pictures on the way are as large as the workers draw in time. */
