@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from tests.learn.stopping import quiet
 
 from terrella.act import Explorer
 from terrella.core import make_rng
+from terrella.core.files import write_json
 from terrella.data import RecordOptions, record
 from terrella.learn.objectives import scroll
 from terrella.learn.recipes.post_training import distil, train_dreams
@@ -34,7 +36,8 @@ def shared(tmp_path_factory, request):
         with open(root / f"{name}.lock", "w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not facts.exists():
-                facts.write_text(json.dumps(make(folder)))
+                shutil.rmtree(folder, ignore_errors=True)  # a process that ended may have left a part of it
+                write_json(facts, make(folder))
         return folder, json.loads(facts.read_text())
 
     return made
