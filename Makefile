@@ -47,7 +47,7 @@ NUMERIC = $(addprefix tests/core/test_,chance.py deferred.py rollout.py) \
 	islet.py latent.py learned.py localisation.py merge.py objects.py parts.py splat.py step_program.py) \
 	$(addprefix tests/learn/test_,adapt.py drift.py flow_frames.py goals.py imitation.py latent_actions.py motion.py moves.py \
 	muon.py objects.py outcome.py post_training.py ppo.py practice.py scroll.py train_latent.py uncertainty.py) \
-	$(addprefix tests/measure/test_,drift.py fidelity.py frechet.py turning.py)
+	$(addprefix tests/measure/test_,drift.py fidelity.py frechet.py turning.py) tests/physics/test_guarded.py
 test-portable: $(VENV)/.ready-dev
 	ATEN_CPU_CAPABILITY=default DNNL_MAX_CPU_ISA=SSE41 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OMP_NUM_THREADS=1 \
 	$(RUN_TESTS) -q -m "not browser and not slow" $(NUMERIC) $(ARGS)
