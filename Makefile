@@ -46,7 +46,7 @@ NUMERIC = $(addprefix tests/core/test_,chance.py deferred.py rollout.py) \
 	$(addprefix tests/worlds/test_,carried_frames.py dispatch.py doom_corridor.py doom_maze.py drift.py fast.py flow.py \
 	islet.py latent.py learned.py localisation.py merge.py objects.py parts.py splat.py step_program.py) \
 	$(addprefix tests/learn/test_,adapt.py drift.py flow_frames.py goals.py imitation.py latent_actions.py motion.py moves.py \
-	muon.py objects.py outcome.py post_training.py ppo.py practice.py scroll.py train_latent.py uncertainty.py) \
+	muon.py objects.py outcome.py post_training.py ppo.py practice.py scroll.py train_latent.py uncertainty.py waypoints.py) \
 	$(addprefix tests/measure/test_,drift.py fidelity.py frechet.py turning.py) tests/physics/test_guarded.py
 test-portable: $(VENV)/.ready-dev
 	ATEN_CPU_CAPABILITY=default DNNL_MAX_CPU_ISA=SSE41 NUMBA_CPU_NAME=generic NUMBA_CPU_FEATURES= OMP_NUM_THREADS=1 \

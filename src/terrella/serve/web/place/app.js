@@ -249,11 +249,11 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
     if (!$('minimap').hidden) map.draw(story.scene, walker.eye, lens().wide, world.body.eye_m);
     seen.painted += 1;
     if (!drawing.soft) shown();
-    $('place').dataset.state = 'open';
   }
 
   /** A picture came onto the screen. */
   function shown() {
+    $('place').dataset.state = 'open';
     seen.times.push(performance.now());
     if (seen.times.length > 240) seen.times.splice(0, 120);
   }
