@@ -105,6 +105,11 @@ def test_it_is_undone_redone_and_edited_as_anything_else(two):
     assert edit(path / "a", "--merge", str(path / "b"), "--move", "20", "0", "0") == 0
     merged, first = opened(path / "a"), (path / "a" / "world.edits.jsonl").read_bytes()
     assert len(merged.gaussians) == 60 + len(there.gaussians)
+    eye = planar_pose(14 * ONE, 0 * ONE, 0 * ONE, 0 * ONE)
+    with_it, without = (
+        rasterise(one, eye, LENS, SIZE).rgb for one in (merged.gaussians, load_source(path / "a").gaussians)
+    )
+    assert not torch.equal(with_it, without)
     assert edit(path / "a", "--undo") == 0 and len(opened(path / "a").gaussians) == 60
     assert edit(path / "a", "--redo") == 0
     again = opened(path / "a")
