@@ -250,11 +250,11 @@ def test_a_killed_commit_is_told_from_damage(recording, monkeypatch, name, nth):
         recorder.add(row(i), np.full(6, i % 2))
     real, calls = getattr(files, name), []
 
-    def failing(*args):
+    def failing(*args, **named):
         calls.append(args)
         if len(calls) == nth:
             raise Killed
-        return real(*args)
+        return real(*args, **named)
 
     monkeypatch.setattr(files, name, failing)
     with pytest.raises(Killed):

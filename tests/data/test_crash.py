@@ -36,11 +36,11 @@ def _stop_at(monkeypatch, name: str, nth: int, error: BaseException) -> None:
     """The nth call of files.NAME raises instead."""
     real, calls = getattr(files, name), []
 
-    def failing(*args):
+    def failing(*args, **named):
         calls.append(args)
         if len(calls) == nth:
             raise error
-        return real(*args)
+        return real(*args, **named)
 
     monkeypatch.setattr(files, name, failing)
 

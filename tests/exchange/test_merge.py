@@ -568,10 +568,10 @@ def test_instructions_keep_their_rows_when_a_merge_begins_later(tmp_path):
 def test_a_merge_that_is_stopped_leaves_nothing(tmp_path, monkeypatch, stage, error):
     """Also after the last row, while the report and the statistics of robots are written."""
 
-    def stop(target, value):
+    def stop(target, value, **named):
         if stage == "takes" or "merge.json" in str(target):
             raise error
-        real(target, value)
+        real(target, value, **named)
 
     real = files.write_json
     monkeypatch.setattr(files, "write_json", stop)

@@ -190,4 +190,14 @@ def _exported(generator: nn.Module, inputs: tuple) -> bytes:
 def _flat(inputs: tuple) -> list[torch.Tensor]:
     """The tensors of noise, flow time and conditioning."""
     noisy, time, conditioning = inputs
-    return [noisy, time, *vars(conditioning.glimpse).values(), conditioning.last, conditioning.context]
+    glimpse = conditioning.glimpse
+    return [
+        noisy,
+        time,
+        glimpse.rgb,
+        glimpse.trust,
+        glimpse.depth,
+        glimpse.known,
+        conditioning.last,
+        conditioning.context,
+    ]
