@@ -37,9 +37,7 @@ class ImitationConfig:
     chunk: int = 1  # actions that it predicts at once
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
-    waypoint: int = (
-        0  # steps after an instruction began of which it predicts its numbers from where that attends to; 0: not
-    )
+    waypoint: int = 0  # steps after an instruction began for which it predicts its numbers; 0: not
     differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones

@@ -94,9 +94,8 @@ def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple
     return Keyframes.joined(some) if some else Keyframes.none(size), picks
 
 
-RgbdFrame = tuple[
-    torch.Tensor, torch.Tensor, torch.Tensor
-]  # rgb uint8 [B, 3, H, W], depth [B, h, w] metres, pose [B, 7]
+# rgb uint8 [B, 3, H, W], depth [B, h, w] metres, pose [B, 7]
+RgbdFrame = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @dataclass(frozen=True)

@@ -172,8 +172,8 @@ def doubts(layers: PictureLayers) -> list[str]:
         )
     if error > UNSURE:
         notes.append(
-            f"the network is unsure of the depth (it estimates an error of {100 * error:.0f}%, of pictures like its training's "
-            f"below {100 * UNSURE:.0f}%): the place may be wrong."
+            f"the network is unsure of the depth (it estimates an error of {100 * error:.0f}%; for pictures like those "
+            f"it learned from, below {100 * UNSURE:.0f}%): the place may be wrong."
         )
     return notes
 
@@ -230,16 +230,14 @@ def _result(
         "height_m": round(layers.height_m, 2), "near_m": round(near, 2), "far_m": round(far, 2), **layers.facts,
         "expected_error": dict(measured), "own_error": round(float(layers.error.mean()), 3), "notes": notes,
     }  # fmt: skip
+    nothing = f"beside and behind the camera is nothing: terrella space grow {out} invents it"
+    around = [] if "panorama" in facts else [nothing]
     lines = [
         f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
         f"{layers.camera}camera {layers.height_m:.2f} m above the floor; depth {near:.1f} to {far:.1f} m",
         expected_error(measured),
         *notes,
-        *(
-            []
-            if "panorama" in facts
-            else [f"beside and behind the camera is nothing: terrella space grow {out} invents it"]
-        ),
+        *around,
         f"walk in it: terrella play {out}",
     ]
     return SpaceResult(facts, tuple(lines))

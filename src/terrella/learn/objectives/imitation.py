@@ -33,9 +33,7 @@ class Demonstrations:
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
     windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
     requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
-    waypoint: Mapping[str, torch.Tensor] | None = (
-        None  # numbers [N, ...] some steps later, at most at the episode's end
-    )
+    waypoint: Mapping[str, torch.Tensor] | None = None  # numbers [N, ...] some steps later, or at the episode's end
     begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
 
 
