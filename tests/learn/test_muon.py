@@ -12,9 +12,9 @@ from terrella.learn.muon import QUINTIC, ROUNDS, Muon, muon, orthogonal
 def test_orthogonal_keeps_the_directions_and_levels_the_sizes(shape, scale):
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0)) * scale
     left, _, right = torch.linalg.svd(matrix, full_matrices=False)
-    sizes = torch.diagonal(left.T @ orthogonal(matrix) @ right.T)
+    sizes = torch.diagonal(left.T @ orthogonal(matrix[None])[0] @ right.T)
     assert 0.6 < sizes.min() and sizes.max() < 1.3
-    torch.testing.assert_close(left @ torch.diag(sizes) @ right, orthogonal(matrix), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(left @ torch.diag(sizes) @ right, orthogonal(matrix[None])[0], atol=1e-3, rtol=1e-3)
 
 
 def test_directions_that_hardly_count_do_not_run_away():
@@ -26,11 +26,11 @@ def test_directions_that_hardly_count_do_not_run_away():
     for _ in range(ROUNDS):
         square = slow @ slow.T
         slow = QUINTIC[0] * slow + (QUINTIC[1] * square + QUINTIC[2] * square @ square) @ slow
-    torch.testing.assert_close(orthogonal(matrix), slow.float(), atol=3e-3, rtol=0)
+    torch.testing.assert_close(orthogonal(matrix[None])[0], slow.float(), atol=3e-3, rtol=0)
 
 
 def test_no_gradient_moves_nothing():
-    assert torch.equal(orthogonal(torch.zeros(3, 4)), torch.zeros(3, 4))
+    assert torch.equal(orthogonal(torch.zeros(1, 3, 4)), torch.zeros(1, 3, 4))
 
 
 def test_the_others_go_as_with_adamw():

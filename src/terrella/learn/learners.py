@@ -26,19 +26,17 @@ class Ema(nn.Module, Generic[Module]):
         super().__init__()
         self.limit, self.module = limit, copy.deepcopy(raw).eval().requires_grad_(False)
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
-        self._number: int | None = 0  # the same, without a wait for the device; None: not known
 
     @torch.no_grad()
     def update(self, raw: nn.Module) -> None:
-        number = int(self.updates) if self._number is None else self._number
-        keep = min(self.limit, (number + 1) / (number + 20))
-        torch._foreach_lerp_(list(self.module.parameters()), list(raw.parameters()), 1 - keep)
+        """Without a wait for the device."""
+        keep = ((self.updates + 1) / (self.updates + 20)).clamp_max(self.limit)
+        mine: list[torch.Tensor] = list(self.module.parameters())
+        theirs: list[torch.Tensor] = list(raw.parameters())
+        away = torch._foreach_sub(theirs, mine)
+        torch._foreach_mul_(away, 1 - keep)
+        torch._foreach_add_(mine, away)
         self.updates += 1
-        self._number = number + 1
-
-    def _load_from_state_dict(self, *given: Any, **options: Any) -> None:
-        super()._load_from_state_dict(*given, **options)
-        self._number = None
 
 
 @dataclass(frozen=True)

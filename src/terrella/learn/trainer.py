@@ -31,6 +31,7 @@ from .learners import Learner
 from .run_folder import load_run, resume_file, save_run, trim_log, write_log
 from .sized_feed import Feed, ResizableFeed
 from .train_step import TrainStep
+from .update import Update
 
 Report = Callable[[float, float, str], None]
 Paced = Callable[[int], None]
@@ -145,6 +146,7 @@ class Trainer:
             module.to(self.device)
         self._halved: list[bool] = []
         self._finite: list[torch.Tensor] = []  # of the steps since losses were last read
+        self._updates: dict[str, Update] = {}  # of each learner
         if saved:
             self._load()
         trim_log(run.out, stage, self.steps_done)
@@ -281,6 +283,7 @@ class Trainer:
             saved = load_run(self._file, {}, {}) or {}
             self.feed.resize(saved.get("batch", self.feed.size))
         self.facts |= load_run(self._file, self.objective.modules, self._optimisers) or {}
+        self._updates.clear()
         self.feed.resume(self.facts["feed"])
 
     def time_steps(self, most_s: float) -> float:
@@ -362,18 +365,13 @@ class Trainer:
             raise _NotFinite(_not_a_number("the loss", step))
         learner.optimiser.zero_grad()
         loss.value.backward()
-        for module in learner.modules:
-            finite = finite & torch.isfinite(nn.utils.clip_grad_norm_(module.parameters(), learner.clip))
+        if loss.learner not in self._updates:
+            self._updates[loss.learner] = Update(learner)
+        finite = self._updates[loss.learner](finite)
         if waits and not finite:
             raise _NotFinite(_not_a_number("a gradient", step))
-        if not waits:  # another device is asked only now and then; until then what is not a number is no step
-            for weight in (weight for module in learner.modules for weight in module.parameters()):
-                if weight.grad is not None:
-                    weight.grad.masked_fill_(~finite, 0)
+        if not waits:  # another device is asked only now and then
             self._finite.append(finite)
-        learner.optimiser.step()
-        if learner.average is not None:
-            learner.average.update(learner.modules[0])
 
     def save(self) -> None:
         """Saves the run as it is after its last whole step. TrainingError, and no save, if a weight is not a number."""

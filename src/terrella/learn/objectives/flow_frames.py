@@ -12,7 +12,7 @@ from ...space.matching import scroll_index
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
-from ..devices import Compiled
+from ..devices import Captured, Compiled
 from ..learners import Ema, warmup_cosine
 from ..moves import StitchedEpisodes
 from ..muon import muon
@@ -102,13 +102,15 @@ class FlowFrames:
         self.generator = channels_last(network)
         self._encode, self._clean = self.generator.encode, self.generator.clean
         self.smooth = Ema(self.generator, 0.995)
+        self._sample = self.smooth.module.sample
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         rate = warmup_cosine(learning_rate, WARMUP // rollout, 0.02)
         self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
 
     def compile(self) -> None:
-        """Has both halves of the network compiled at their first call."""
+        """Has both halves of the network compiled at their first call, and drawing captured as a CUDA graph."""
         self._encode, self._clean = Compiled(self.generator.encode), Compiled(self.generator.clean)
+        self._sample = Captured(self.smooth.module.sample)
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
         slots = self.generator.config.slots
@@ -172,5 +174,5 @@ class FlowFrames:
         scroll, memory = (None if each is None else each[:batch] for each in (scroll, memory))
         noise = now.randn(batch, 3, *network.config.size)
         with now.half():
-            drawn = network.sample(shown.float() / 127.5 - 1, context[:batch], scroll, memory, noise, steps)
+            drawn = self._sample(shown.float() / 127.5 - 1, context[:batch], scroll, memory, noise, steps)
         return pixels(drawn.float())
