@@ -1,5 +1,7 @@
 """Guarded: a World that detects, corrects, counts and dumps; a correction that freezes motion is caught."""
 
+import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -12,7 +14,9 @@ from terrella.core.errors import TerrellaError
 from terrella.physics import PhysicalSystem, calibrate, trajectory_of
 from terrella.physics.guarded import GuardConfig, Guarded, replay_case
 from terrella.physics.judge import Judge, changed_rollouts
-from terrella.physics.system import RigidBody, Slot, Wall
+from terrella.physics.laws.limits import Limits
+from terrella.physics.system import Limit, RigidBody, Slot, Wall
+from terrella.physics.tolerance import Tolerance
 from terrella.sim.bodies import BodiesConfig, BodiesWorld
 
 STEPS = 24
@@ -106,6 +110,43 @@ def test_the_kernel_is_the_laws_themselves(family):
         assert torch.equal(mine.changed, slow.changed) and not mine.changed[~allowed].any()
         broken += int((mine.before > 1).any(1).sum())
     assert broken > 100 or family == "stacking" and broken > 30
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("family", ["collision", "pendulum", "rolling", "stacking"])
+def test_a_body_whose_numbers_are_not_finite_is_not_there(family, value):
+    """Kernel and laws say the same of each number in turn, in the step and in the instant before; a vanished body goes on."""
+    judge, flat, spoiled = shaken(family, 40 if family == "stacking" else 60, 3)
+    rows = torch.arange(flat.shape[1])
+    fresh, allowed, number = rows % 5 == 0, rows % 7 != 0, rows % flat.shape[2]
+    for early in (False, True):
+        held, seen = flat[7:9].transpose(0, 1).clone(), spoiled[9].clone()
+        (held[:, 1] if early else seen)[rows, number] = value
+        held[fresh, 0] = held[fresh, 1]
+        mine = judge(held, seen, fresh, allowed)
+        with tensor_programs():
+            slow = judge(held, seen, fresh, allowed)
+        for name in ("before", "left", "seen", "way"):
+            pair = getattr(mine, name), getattr(slow, name)
+            assert torch.allclose(*pair, rtol=1e-6, atol=1e-7, equal_nan=True), (name, early)
+        assert torch.equal(mine.changed, slow.changed)
+        assert (mine.before[:, 0] > 1).all() or early and (mine.before[~fresh, 0] == 0).any()
+        assert early or mine.seen[allowed].isfinite().all() and mine.seen[~allowed].isfinite().all(1).sum() == 0
+
+
+def test_a_joint_that_is_not_a_number_stays_broken():
+    ball = RigidBody("ball", Slot("state"), Slot("state", 3), radius_m=0.1)
+    system = PhysicalSystem((ball,), limits=(Limit("elbow", Slot("state", 6), -1.0, 1.0, "rad"),))
+    judge = Judge(system, [Tolerance(Limits(), 0.01, 100, 0.01)], 0.02, {"state": 7})
+    rows = torch.zeros(3, 3, 7, dtype=torch.float64)
+    rows[:, 2, 6] = torch.tensor([math.nan, 2.0, 0.5])
+    every = torch.ones(3, dtype=torch.bool)
+    for way in (nullcontext(), tensor_programs()):
+        with way:
+            found = judge(rows[:, :2], rows[:, 2], ~every, every)
+        assert found.before[:, 0].isinf().tolist() == [True, False, False] and found.left[0, 0].isinf()
+        assert found.seen[:2, 6].isnan().tolist() == [True, False] and found.seen[1, 6] == 1.0
+        assert found.changed.tolist() == [False, True, False]
 
 
 def test_the_truth_is_left_as_it_is():

@@ -28,7 +28,7 @@ ORDER = (
     "permanence", "free fall", "momentum", "support and friction", "limits", "energy", "continuity", "non-penetration",
 )  # fmt: skip
 ROUNDS = 3  # of projections: one may break a law that was kept before
-_PLACED = ("position", "velocity", "rotation", "spin", "present")
+_PLACED = ("position", "velocity", "rotation", "spin", "present", "radius")
 
 
 @dataclass(frozen=True)
@@ -190,13 +190,14 @@ def changed_rollouts(before: Trajectory, after: Trajectory) -> Tensor:
         return torch.zeros(before.batch, dtype=torch.bool)
     parts = [(getattr(before, name), getattr(after, name)) for name in _PLACED]
     parts += [(part, after.channels[name]) for name, part in before.channels.items()]
-    return torch.stack([(one[-1] != other[-1]).flatten(1).any(1) for one, other in parts]).any(0)
+    apart = [(one != other) & ((one == one) | (other == other)) for one, other in ((a[-1], b[-1]) for a, b in parts)]
+    return torch.stack([part.flatten(1).any(1) for part in apart]).any(0)
 
 
 def _mixed(motion: Trajectory, other: Trajectory, rows: Tensor) -> Trajectory:
     """The rollouts `rows` (bool [B]) of `other`, the rest of `motion`."""
     parts: dict[str, Any] = {}
-    for name in (*_PLACED, "radius"):
+    for name in _PLACED:
         mine, theirs = getattr(motion, name), getattr(other, name)
         parts[name] = torch.where(rows.view(1, -1, *[1] * (mine.ndim - 2)), theirs, mine)
     channels = {

@@ -202,9 +202,12 @@ def trajectory_of(system: PhysicalSystem, observations: Mapping[str, Tensor], dt
 
 
 def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], dt_s: float) -> tuple[Tensor, ...]:
-    position = _spread(_numbers(flat, body.position, len(system.axes)), system.axes)
+    """A body is there where each number that the channels hold of it is finite; what is not finite reads as 0, or as no rotation."""
+    read = [_numbers(flat, body.position, len(system.axes))]
+    position = _spread(read[0], system.axes)
     if body.velocity is not None:
-        velocity = _spread(_numbers(flat, body.velocity, len(system.axes)), system.axes)
+        read.append(_numbers(flat, body.velocity, len(system.axes)))
+        velocity = _spread(read[-1], system.axes)
     elif len(position) > 1:
         way = position.diff(dim=0)
         half = _gained(system, body, way, dt_s)  # from the middle of each step to its end
@@ -212,18 +215,24 @@ def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], d
     else:
         velocity = torch.zeros_like(position)
     upright = position.new_tensor([1.0, 0, 0, 0]).expand(*position.shape[:2], 4)
-    rotation = upright if body.rotation is None else _numbers(flat, body.rotation, 4)
-    rotation = rotation / rotation.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    spin = torch.zeros_like(position)
+    rotation, spin = upright, torch.zeros_like(position)
+    if body.rotation is not None:
+        read.append(_numbers(flat, body.rotation, 4))
+        turned = read[-1] / read[-1].norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        rotation = torch.where(read[-1].isfinite().all(-1, keepdim=True), turned, upright)
     if body.spin is not None:
-        spin = _spread(_numbers(flat, body.spin, len(system.spin_axes)), system.spin_axes)
-    here = torch.ones(position.shape[:2], dtype=torch.bool)
-    if body.present is not None:
-        here = _numbers(flat, body.present, 1)[..., 0] != 0
-    here = here & position.isfinite().all(-1)
+        read.append(_numbers(flat, body.spin, len(system.spin_axes)))
+        spin = _spread(read[-1], system.spin_axes)
     given = body.radius_m
-    radius = _numbers(flat, given, 1)[..., 0] if isinstance(given, Slot) else torch.full_like(position[..., 0], given)
-    return position.nan_to_num(), velocity.nan_to_num(), rotation, spin.nan_to_num(), here, radius
+    radius = torch.full_like(position[..., 0], 0.0 if isinstance(given, Slot) else given)
+    if isinstance(given, Slot):
+        read.append(_numbers(flat, given, 1))
+        radius = read[-1][..., 0]
+    here = torch.cat(read, -1).isfinite().all(-1)
+    if body.present is not None:
+        here = here & (_numbers(flat, body.present, 1)[..., 0] != 0)
+    position, velocity, spin, radius = (part.nan_to_num(0, 0, 0) for part in (position, velocity, spin, radius))
+    return position, velocity, rotation, spin, here, radius
 
 
 def _gained(system: PhysicalSystem, body: RigidBody, way: Tensor, dt_s: float) -> Tensor:
@@ -258,7 +267,7 @@ def _spread(values: Tensor, axes: tuple[int, ...]) -> Tensor:
 
 
 def channels_of(motion: Trajectory) -> dict[str, Tensor]:
-    """The channels of the last instant [B, K], with the bodies of the motion written into them: the inverse of `trajectory_of`."""
+    """The channels of the last instant [B, K], with the bodies that are there written into them: the inverse of `trajectory_of`."""
     flat = {name: part[-1].clone() for name, part in motion.channels.items()}
     axes, spin_axes = list(motion.system.axes), list(motion.system.spin_axes)
     for at, body in enumerate(motion.system.bodies):
@@ -266,11 +275,13 @@ def channels_of(motion: Trajectory) -> dict[str, Tensor]:
         parts += [(body.velocity, motion.velocity[-1, :, at][:, axes])] if body.velocity else []
         parts += [(body.rotation, motion.rotation[-1, :, at])] if body.rotation else []
         parts += [(body.spin, motion.spin[-1, :, at][:, spin_axes])] if body.spin else []
+        parts += [(body.radius_m, motion.radius[-1, :, at, None])] if isinstance(body.radius_m, Slot) else []
+        here = motion.present[-1, :, at]
+        for slot, values in parts:
+            held = flat[slot.channel][:, slot.first : slot.first + values.shape[1]]
+            held.copy_(torch.where(here[:, None], values, held))
         if body.present is not None:
             held = flat[body.present.channel][:, body.present.first]
-            here = motion.present[-1, :, at]
             was = motion.channels[body.present.channel][-2, :, body.present.first] if motion.steps else held
-            parts.append((body.present, torch.where(here, torch.where(held != 0, held, was), 0.0)[:, None]))
-        for slot, values in parts:
-            flat[slot.channel][:, slot.first : slot.first + values.shape[1]] = values
+            held.copy_(torch.where(here, torch.where(held != 0, held, was), 0.0))
     return flat

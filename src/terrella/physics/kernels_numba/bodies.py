@@ -93,9 +93,7 @@ def most(one, other):
 
 @compiled
 def finite(value):
-    if value != value:
-        return 0.0
-    return min(max(value, -1.7976931348623157e308), 1.7976931348623157e308)
+    return value if math.isfinite(value) else 0.0
 
 
 @compiled
@@ -120,27 +118,40 @@ def load(s, r):
                     here &= math.isfinite(r[one, c.P + axis])
                     if s[body, c.AT_V] >= 0:
                         r[one, c.V + axis] = r[flat, int(s[body, c.AT_V]) + j]
+                        here &= math.isfinite(r[one, c.V + axis])
                 if spin >= 0 and s[body, c.AT_S] >= 0:
-                    r[one, c.S + spin] = finite(r[flat, int(s[body, c.AT_S]) + j])
-            r[one, c.Q] = 1.0
-            if s[body, c.AT_Q] >= 0:
-                length = 0.0
-                for k in range(4):
-                    r[one, c.Q + k] = r[flat, int(s[body, c.AT_Q]) + k]
-                    length += r[one, c.Q + k] ** 2
-                for k in range(4):
-                    r[one, c.Q + k] /= max(math.sqrt(length), 1e-9)
+                    r[one, c.S + spin] = r[flat, int(s[body, c.AT_S]) + j]
+                    here &= math.isfinite(r[one, c.S + spin])
+            here &= load_rotation(s, r, body, one, flat)
+            r[one, c.RADIUS] = s[body, c.GIVEN_RADIUS]
+            if s[body, c.AT_RADIUS] >= 0:
+                r[one, c.RADIUS] = r[flat, int(s[body, c.AT_RADIUS])]
+                here &= math.isfinite(r[one, c.RADIUS])
             if s[body, c.AT_HERE] >= 0:
                 here &= r[flat, int(s[body, c.AT_HERE])] != 0
             r[one, c.HERE] = here
-            r[one, c.RADIUS] = (
-                s[body, c.GIVEN_RADIUS] if s[body, c.AT_RADIUS] < 0 else r[flat, int(s[body, c.AT_RADIUS])]
-            )
         if s[body, c.AT_V] < 0:
             differences(s, r, n)
         for i in range(3):
-            for k in range(c.P, c.Q):
+            for k in range(c.P, c.MASS):
                 r[at(s, i, n), k] = finite(r[at(s, i, n), k])
+
+
+@compiled
+def load_rotation(s, r, body, one, flat):
+    """Writes the unit quaternion of a body; whether its numbers are finite. Without, or where they are not, it is upright."""
+    length = 0.0
+    if s[body, c.AT_Q] >= 0:
+        for k in range(4):
+            r[one, c.Q + k] = r[flat, int(s[body, c.AT_Q]) + k]
+            length += r[one, c.Q + k] ** 2
+    known = math.isfinite(length)
+    for k in range(4):
+        if s[body, c.AT_Q] >= 0 and known:
+            r[one, c.Q + k] /= max(math.sqrt(length), 1e-9)
+        else:
+            r[one, c.Q + k] = 1.0 if k == 0 else 0.0
+    return known
 
 
 @compiled

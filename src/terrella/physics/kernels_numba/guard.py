@@ -85,25 +85,16 @@ def write(s, r, seen, b):
     """The channels with the corrected bodies in them; whether anything changed."""
     changed, flat = False, flat_at(s, 2)
     for k in range(seen.shape[1]):
-        changed |= seen[b, k] != r[flat, k]
+        changed |= seen[b, k] != r[flat, k] and (seen[b, k] == seen[b, k] or r[flat, k] == r[flat, k])
     for n in range(count_of(s)):
-        for k in range(c.P, c.RADIUS):
+        for k in range(c.P, c.SIZE):
             changed |= r[at(s, 3, n), k] != r[at(s, 2, n), k]
     if not changed:
         return False
     for n in range(count_of(s)):
         body, one = 1 + n, at(s, 2, n)
-        for j in range(3):
-            axis, spin = int(s[0, c.AXES + j]), int(s[0, c.SPIN_AXES + j])
-            if axis >= 0:
-                r[flat, int(s[body, c.AT_P]) + j] = r[one, c.P + axis]
-                if s[body, c.AT_V] >= 0:
-                    r[flat, int(s[body, c.AT_V]) + j] = r[one, c.V + axis]
-            if spin >= 0 and s[body, c.AT_S] >= 0:
-                r[flat, int(s[body, c.AT_S]) + j] = r[one, c.S + spin]
-        if s[body, c.AT_Q] >= 0:
-            for k in range(4):
-                r[flat, int(s[body, c.AT_Q]) + k] = r[one, c.Q + k]
+        if r[one, c.HERE] > 0:
+            write_body(s, r, body, one, flat)
         if s[body, c.AT_HERE] >= 0:
             k = int(s[body, c.AT_HERE])
             held = r[flat, k] if r[flat, k] != 0 else r[flat_at(s, 1), k]
@@ -111,6 +102,23 @@ def write(s, r, seen, b):
     for k in range(seen.shape[1]):
         seen[b, k] = r[flat, k]
     return True
+
+
+@compiled
+def write_body(s, r, body, one, flat):
+    for j in range(3):
+        axis, spin = int(s[0, c.AXES + j]), int(s[0, c.SPIN_AXES + j])
+        if axis >= 0:
+            r[flat, int(s[body, c.AT_P]) + j] = r[one, c.P + axis]
+            if s[body, c.AT_V] >= 0:
+                r[flat, int(s[body, c.AT_V]) + j] = r[one, c.V + axis]
+        if spin >= 0 and s[body, c.AT_S] >= 0:
+            r[flat, int(s[body, c.AT_S]) + j] = r[one, c.S + spin]
+    if s[body, c.AT_Q] >= 0:
+        for k in range(4):
+            r[flat, int(s[body, c.AT_Q]) + k] = r[one, c.Q + k]
+    if s[body, c.AT_RADIUS] >= 0:
+        r[flat, int(s[body, c.AT_RADIUS])] = r[one, c.RADIUS]
 
 
 @compiled

@@ -67,8 +67,9 @@ def permanence(s, r, fresh):
 
 @compiled
 def copy(r, before, after):
-    for k in range(c.P, c.HERE):
-        r[after, k] = r[before, k]
+    for k in range(c.P, c.SIZE):
+        if k != c.HERE:
+            r[after, k] = r[before, k]
 
 
 @compiled

@@ -70,7 +70,8 @@ def keep_limits(s, r):
     for k in range(int(s[0, c.LIMIT_COUNT])):
         one = limit_at(s, k)
         flat, number = flat_at(s, 2), int(s[one, c.NUMBER])
-        r[flat, number] = min(max(r[flat, number], s[one, c.LEAST]), s[one, c.MOST])
+        if r[flat, number] == r[flat, number]:  # not a number stays broken
+            r[flat, number] = min(max(r[flat, number], s[one, c.LEAST]), s[one, c.MOST])
 
 
 # -- energy -----------------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from ..system import PhysicalSystem
 from ..trajectory import Trajectory
 from .law import occasions, with_last
 
-_PLACE = ("position", "velocity", "rotation", "spin")
+_PLACE = ("position", "velocity", "rotation", "spin", "radius")
 MERGED = 0.1  # of the sum of two sizes: nearer centres are one body
 
 
@@ -51,13 +51,15 @@ class Permanence:
     def correct(self, motion: Trajectory) -> Trajectory:
         """Bodies that vanished go on as they went; those that left the bounds are where they were; new ones go."""
         was, vanished = motion.present[-2], motion.present[-2] & ~motion.present[-1]
-        parts = {
-            name: torch.where(vanished[..., None], getattr(motion, name)[-2], getattr(motion, name)[-1])
-            for name in _PLACE
-        }
+        parts = {name: _before(motion, name, vanished, getattr(motion, name)[-1]) for name in _PLACE}
         parts["position"] = parts["position"] + vanished[..., None] * motion.velocity[-2] * motion.dt_s
         if motion.system.bounds_m is not None:
             low, high = motion.position.new_tensor(motion.system.bounds_m)
-            lost = ((parts["position"] < low) | (parts["position"] > high)).any(-1, keepdim=True)
-            parts = {name: torch.where(lost, getattr(motion, name)[-2], part) for name, part in parts.items()}
+            lost = ((parts["position"] < low) | (parts["position"] > high)).any(-1)
+            parts = {name: _before(motion, name, lost, part) for name, part in parts.items()}
         return with_last(motion, present=was, **parts)
+
+
+def _before(motion: Trajectory, name: str, rows: Tensor, last: Tensor) -> Tensor:
+    """`last` [B, N, ...], with the instant before in the bodies `rows` (bool [B, N])."""
+    return torch.where(rows[..., None] if last.ndim > 2 else rows, getattr(motion, name)[-2], last)
