@@ -202,7 +202,7 @@ def trajectory_of(system: PhysicalSystem, observations: Mapping[str, Tensor], dt
 
 
 def _body(system: PhysicalSystem, body: RigidBody, flat: Mapping[str, Tensor], dt_s: float) -> tuple[Tensor, ...]:
-    """A body is there where each number that the channels hold of it is finite; what is not finite reads as 0, or as no rotation."""
+    """A body is there where each number that the channels hold of it is finite; what is not reads as 0, or as no rotation."""
     read = [_numbers(flat, body.position, len(system.axes))]
     position = _spread(read[0], system.axes)
     if body.velocity is not None:
