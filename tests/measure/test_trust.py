@@ -17,7 +17,7 @@ from terrella.learn.recipes.policy import Practice
 from terrella.measure.clips import Clip
 from terrella.measure.exam import CLIPS, Exam, ExamConfig
 from terrella.measure.examine import examine
-from terrella.measure.trust import TRUST, forecast_trust, steps_within
+from terrella.measure.trust import TRUST, forecast_trust, steps_within, trust_figures
 from terrella.workflows.trust import practice_within_trust, search_within_trust
 
 CARD = {"uncertainty": {"ceiling": 0.4}}
@@ -100,7 +100,23 @@ def test_the_scorecard_has_the_forecast_beside_the_measured_horizon(off, steps):
     card = examine(Exam({"a": Fading(off)}, {CLIPS: {"recorded": [black(32)] * 2}}, config), probes=(TRUST,))
     (forecast,), (measured,) = (card.find("trust", f"trust horizon, {what}") for what in ("forecast", "measured"))
     assert (forecast.figure.value, measured.figure.value) == (20, steps)
+    assert (measured.figure.low, measured.figure.high, measured.figure.count) == (steps, steps, 2)
     assert ("not reached" in measured.note) == (steps == 30)
+    ratio = [row.figure.value for row in card.find("trust", "trust horizon, measured over forecast")]
+    assert ratio == ([] if steps == 30 else [steps / 20])
+
+
+def test_the_horizon_has_an_interval_over_clips():
+    """Half of the rollouts are lost at step 10 and half never: the mean error crosses the level where more than half are lost."""
+    lost = torch.zeros(8, 30, dtype=torch.float64)
+    lost[:5, 10:] = 0.4
+    expected = torch.linspace(0, 0.4, 30).expand(8, 30)
+    figures = {what: figure for what, (figure, _) in trust_figures(expected, lost, 0.4).items()}
+    measured, ratio = figures["measured"], figures["measured over forecast"]
+    assert (measured.value, measured.low, measured.high) == (10, 10, 30)
+    assert figures["forecast"].low == figures["forecast"].high == 15
+    assert (ratio.value, ratio.high) == (pytest.approx(10 / 15), 2)
+    assert trust_figures(expected, lost[:5].repeat(2, 1)[:8], 0.4)["measured"][0].high == 10
 
 
 def test_a_world_that_expects_no_error_is_named_with_what_it_lacks():

@@ -110,6 +110,15 @@ def median_interval(values: torch.Tensor, rng: torch.Generator) -> Figure:
     return figure_of(values.quantile(0.5), values[picks].quantile(0.5, dim=1), len(values))
 
 
+def curve_interval(
+    values: torch.Tensor, measure: Callable[[torch.Tensor], torch.Tensor], rng: torch.Generator
+) -> Figure:
+    """What `measure` (curves [R, T] -> [R]) finds in the mean curve of values [n, T], with an interval over clips."""
+    values = values.double()
+    resampled = _weights(len(values), rng) @ values / len(values)
+    return figure_of(measure(values.mean(0, keepdim=True))[0], measure(resampled), len(values))
+
+
 def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Generator) -> Figure:
     """The last step up to which the mean of values [n, T] has stayed at or above the mean of floor [n].
 
@@ -121,7 +130,7 @@ def last_step_above(values: torch.Tensor, floor: torch.Tensor, rng: torch.Genera
         """Means [..., T] -> steps before the first that is below 0: [...]."""
         return (means >= -1e-9).cumprod(-1).sum(-1).double()
 
-    return figure_of(last(over.mean(0)), last(_weights(len(over), rng) @ over / len(over)), len(over))
+    return curve_interval(over, last, rng)
 
 
 def _band(centre: torch.Tensor, resample: Callable, count: int, rng: torch.Generator) -> Band:

@@ -5,7 +5,7 @@ observations differ by. The forecast needs no truth: it takes the world's own `u
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +18,7 @@ from .clips import Clip, evidence
 from .exam import CLIPS, LONG, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric, rows_at
 from .scorecard import PREDICTED, ProbeReport, Row
-from .statistics import Figure
+from .statistics import Figure, curve_interval
 
 ROLLOUTS, HOLD = 8, (3, 40)  # of a forecast; steps for which its random actions are held
 LEAD = (
@@ -45,8 +45,13 @@ class TrustForecast:
 def steps_within(errors: torch.Tensor, level: float) -> int:
     """The steps before the errors [T] reach the level for good, by the split into lower and higher ones that fits best: of errors
     that only grow, those below the level."""
-    left = (level - errors.double()).cumsum(0)
-    return int(torch.cat([left.new_zeros(1), left]).argmax())
+    return int(_change_points(errors[None], torch.tensor([level]))[0])
+
+
+def _change_points(errors: torch.Tensor, level: torch.Tensor) -> torch.Tensor:
+    """`steps_within` of curves [R, T] and levels [R], float64 [R]."""
+    left = (level[:, None] - errors.double()).cumsum(1)
+    return torch.cat([torch.zeros_like(left[:, :1]), left], 1).argmax(1).double()
 
 
 @torch.inference_mode()
@@ -102,6 +107,35 @@ def errors_of(dreamt: Results) -> torch.Tensor:
     return ((dreamt["latent"] - truth) / unit).square().mean(-1).sqrt()
 
 
+def _horizons(chance: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Of mean curves [R, T] of an error: the steps within trust [R]."""
+
+    def steps(curves: torch.Tensor) -> torch.Tensor:
+        levels = [trust_level(first, chance) for first in curves[:, 0].tolist()]
+        return _change_points(curves, torch.tensor(levels, dtype=torch.float64))
+
+    return steps
+
+
+def trust_figures(expected: torch.Tensor, error: torch.Tensor, chance: float) -> dict[str, tuple[Figure, str]]:
+    """Name -> (figure, note): the forecast horizon, the measured one, in steps, and, where trust ends within the rollouts, the
+    second over the first. Of rollouts [n, T]; intervals are over rollouts, the same resamples for all."""
+    steps, limit, found = _horizons(chance), error.shape[1], {}
+    for what, curves in (("forecast", expected), ("measured", error)):
+        figure = curve_interval(curves, steps, make_rng(0))
+        level = trust_level(float(curves[:, 0].double().mean()), chance)
+        note = f"mean error of {level:.3g}" + ("" if figure.value < limit else "; not reached in these rollouts")
+        found[what] = figure, note
+
+    def ratio(curves: torch.Tensor) -> torch.Tensor:
+        return steps(curves[:, limit:]) / steps(curves[:, :limit]).clamp_min(1)
+
+    if max(figure.value for figure, _ in found.values()) < limit:
+        both = torch.cat([expected.double(), error.double()], 1)
+        found["measured over forecast"] = curve_interval(both, ratio, make_rng(0)), "the aim is 0.67 to 1.5"
+    return found
+
+
 def _report(exam: Exam, results: ExamResults) -> ProbeReport:
     """Of the longest rollouts of each place."""
     report = ProbeReport()
@@ -110,14 +144,11 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
             dreamt = results.dreamt(LONG, arm, place, PREDICTED) or results.dreamt(CLIPS, arm, place, PREDICTED)
             if "expected" not in dreamt:
                 continue
-            expected, error = dreamt["expected"].float().mean(0), errors_of(dreamt).float().mean(0)
-            level, limit = trust_level(float(expected[0]), chance_error(world.spec)), len(error)
-            for what, curve in (("forecast", expected), ("measured", error)):
-                steps = steps_within(curve, level)
-                note = f"mean error of {level:.3g}" + ("; not reached in these rollouts" if steps == limit else "")
-                figure = Figure(float(steps), math.nan, math.nan, len(dreamt["expected"]))
+            error = errors_of(dreamt)
+            for what, (figure, note) in trust_figures(dreamt["expected"], error, chance_error(world.spec)).items():
+                unit, name = "" if "over" in what else "steps", f"trust horizon, {what}"
                 report.rows.append(
-                    Row("trust", "", f"trust horizon, {what}", "steps", place, arm, PREDICTED, limit, figure, note=note)
+                    Row("trust", "", name, unit, place, arm, PREDICTED, error.shape[1], figure, note=note)
                 )
     return report
 
