@@ -120,20 +120,20 @@ def _horizons(chance: float) -> Callable[[torch.Tensor], torch.Tensor]:
 def trust_figures(expected: torch.Tensor, error: torch.Tensor, chance: float) -> dict[str, tuple[Figure, str]]:
     """Name -> (figure, note): the forecast horizon, the measured one, in steps, and, where trust ends within the rollouts, the
     second over the first. Of rollouts [n, T]; intervals are over rollouts, the same resamples for all."""
-    steps, limit, found = _horizons(chance), error.shape[1], {}
+    steps, limit, figures = _horizons(chance), error.shape[1], {}
     for what, curves in (("forecast", expected), ("measured", error)):
         figure = curve_interval(curves, steps, make_rng(0))
         level = trust_level(float(curves[:, 0].double().mean()), chance)
         note = f"mean error of {level:.3g}" + ("" if figure.value < limit else "; not reached in these rollouts")
-        found[what] = figure, note
+        figures[what] = figure, note
 
     def ratio(curves: torch.Tensor) -> torch.Tensor:
         return steps(curves[:, limit:]) / steps(curves[:, :limit]).clamp_min(1)
 
-    if max(figure.value for figure, _ in found.values()) < limit:
+    if max(figure.value for figure, _ in figures.values()) < limit:
         both = torch.cat([expected.double(), error.double()], 1)
-        found["measured over forecast"] = curve_interval(both, ratio, make_rng(0)), "the aim is 0.67 to 1.5"
-    return found
+        figures["measured over forecast"] = curve_interval(both, ratio, make_rng(0)), "the aim is 0.67 to 1.5"
+    return figures
 
 
 def _report(exam: Exam, results: ExamResults) -> ProbeReport:
