@@ -65,6 +65,16 @@ def test_a_floor_goes_on_over_holes_and_ends_a_metre_beyond_what_is_known(room):
         assert torch.allclose(walked(plain, way), walked(closed, way), atol=0.11)
 
 
+def test_haze_of_fits_stops_nobody_where_one_begins_nor_on_the_way(room):
+    haze = join([room, slab((2.2, 2.0, 0.7), (2.25, 2.05, 0.8)), slab((1.0, 1.9, 1.0), (1.05, 1.95, 1.1))])
+    plain, closed = (enclosed(haze, EYE, kind, BODY) for kind in ("open", "indoor"))
+    assert bool(plain.blocked(EYE, BODY)) and not bool(closed.blocked(EYE, BODY))
+    assert walked(plain, (-0.1, 0), start=torch.tensor([[1.6, 1.95, 1.6]]))[0] > 1.2
+    assert walked(closed, (-0.1, 0))[0] < 0.4
+    pillar = enclosed(join([room, slab((1.0, 1.0, 0.0), (1.0, 3.0, 1.5))]), EYE, "indoor", BODY)
+    assert walked(pillar, (-0.1, 0))[0] > 1.2  # what is larger stays
+
+
 @pytest.mark.parametrize("high_m", [0.5, 1.0, 2.4])
 def test_a_floor_lies_where_it_is_wherever_above_it_one_looks_from(room, high_m):
     deep = join([room, slab((5, 5, -3), (6, 6, -3))])  # the grid goes on below the floor

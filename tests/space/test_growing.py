@@ -9,7 +9,6 @@ import pytest
 import torch
 from tests.space.test_panorama import SIZE, room
 
-import terrella
 from terrella.cli import main
 from terrella.space import growing
 from terrella.space.camera import planar_pose, rotation
@@ -30,6 +29,8 @@ from terrella.space.raster import Gaussians, join, rasterise
 from terrella.space.raster.gaussians import plain_sh
 from terrella.space.raster.move import transform
 from terrella.space.room_planes import room_planes
+from terrella.workflows.grow_space import GrowSpaceConfig, depth_error, fill_of
+from terrella.workflows.splat_places import open_splat
 from terrella.worlds.additions import INVENTED
 from terrella.worlds.splat import SplatConfig, SplatWorld
 from terrella.worlds.splat_folder import load_source, read_edits, save_splat
@@ -50,7 +51,7 @@ def half_room(path) -> SplatWorld:
     config = SplatConfig((0.5, 0.5, 0.5, 0.5), (64, 64))
     start = planar_pose(ZERO, ZERO, EYE[2], ZERO)[None]
     save_splat(SplatWorld("half", scene, torch.ones(len(scene), dtype=torch.uint8), start, config), path)
-    return terrella.load(path)
+    return open_splat(str(path))
 
 
 def test_the_planes_of_a_room_are_measured_where_they_are_seen():
@@ -64,6 +65,31 @@ def test_the_planes_of_a_room_are_measured_where_they_are_seen():
     assert ahead[0][:5].tolist() == pytest.approx(SIZE[[0, 1, 1, 2, 2]].tolist(), abs=0.06)
     assert sum(planes.seen) == 5 and 1.4 < float(ahead[0][5]) < 4.1  # behind the camera nothing was seen
     assert bool((ahead[1] >= 0).all()) and bool((ahead[1] <= 1).all())
+
+
+def test_away_from_what_was_seen_planes_lie_farther_out_by_the_error_of_depth():
+    ways = torch.tensor([[1.0, 0, 0], [-0.3, 1.0, 0], [-0.4, 0, 1.0], [-0.4, 0, -1.0]])
+    sure, unsure = (room_planes(front(), EYE, error).hit(EYE, ways)[0] for error in (0.0, 0.2))
+    assert (unsure / sure).tolist() == pytest.approx([1, 1.2, 1.2, 1.2], abs=1e-3)
+    beside = torch.tensor([[x, 1.0, 0.0] for x in (0.9, 0.7, 0.5, 0.2)])  # from the seen part of a wall on
+    bulge = room_planes(front(), EYE, 0.2).hit(EYE, beside)[0] - room_planes(front(), EYE).hit(EYE, beside)[0]
+    assert (
+        float(bulge[0]) == pytest.approx(0, abs=1e-3) and bool((bulge.diff() > -1e-3).all()) and float(bulge[3]) > 0.2
+    )
+
+
+def test_the_expected_error_of_a_place_says_how_far_out_its_planes_lie(tmp_path):
+    place = half_room(tmp_path / "place")
+    for error, share in ((0.2, 0.2), (7.0, 0.3), (-1, 0.0), (math.nan, 0.0), ("no", 0.0), (None, 0.0)):
+        place.card["depth_error"] = error
+        assert depth_error(place) == share
+    place.card["depth_error"] = 0.2
+    near, far = (fill_of(one, GrowSpaceConfig()) for one in (open_splat(str(tmp_path / "place")), place))
+    pose = planar_pose(ZERO, ZERO, EYE[2], torch.tensor(math.atan2(1.0, -0.3)))
+    drawn = rasterise(place.gaussians, pose[None], CAMERA, (9, 9))
+    assert float(far(drawn, pose)[0][4, 4] / near(drawn, pose)[0][4, 4]) == pytest.approx(
+        1.25, abs=0.01
+    )  # 1.25 times 0.2
 
 
 def test_walls_are_measured_at_any_heading():
@@ -124,7 +150,7 @@ def test_a_place_grows_is_undone_and_goes_on(tmp_path, capsys):
     assert len(read_edits(tmp_path / "place")) == 2 and len(load_source(tmp_path / "place").gaussians) == len(
         place.gaussians
     )
-    grown = terrella.load(tmp_path / "place")
+    grown = open_splat(str(tmp_path / "place"))
     new = len(place.gaussians)
     assert len(grown.gaussians) == new + sum(step["added"] for step in steps)
     assert bool((grown.provenance[new:] == INVENTED).all()) and grown.object_names == [
@@ -132,7 +158,7 @@ def test_a_place_grows_is_undone_and_goes_on(tmp_path, capsys):
         "invented, step 2",
     ]
     assert main(["space", "edit", name, "--undo"]) == 0
-    assert len(terrella.load(tmp_path / "place").gaussians) == new + steps[0]["added"]
+    assert len(open_splat(str(tmp_path / "place")).gaussians) == new + steps[0]["added"]
     capsys.readouterr()
     assert main(["space", "grow", name, "--to", "0.9", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -150,7 +176,7 @@ def test_the_same_seed_grows_the_same_place(tmp_path):
     places = [half_room(tmp_path / name) and str(tmp_path / name) for name in "ab"]
     for name in places:
         assert main(["space", "grow", name, "--steps", "1", "--seed", "3"]) == 0
-    one, other = (terrella.load(name).gaussians for name in places)
+    one, other = (open_splat(str(name)).gaussians for name in places)
     assert torch.equal(one.means, other.means) and torch.equal(one.sh, other.sh)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from .carving import carved
-from .flooring import floored
-from .kernels_numba.flood import flood, spread
+from .flooring import floored, standing
+from .kernels_numba.flood import flood, spread, without_islands
 from .occupancy import Occupancy, Walker
 from .raster import Gaussians
 
@@ -18,6 +18,7 @@ ColliderKind = Literal["open", "indoor", "outdoor", "object"]
 ColliderChoice = Literal["auto", "open", "indoor", "outdoor", "object"]
 GAP_CELLS = 2  # cells from any obstacle that the flood keeps: narrower gaps than twice this and a cell are closed
 BEYOND_M = 1.0  # how far a floor goes on where it has holes or ends
+ISLAND = 12  # cells of a group below which it is taken for haze, as fits have it
 CEILED = 0.6  # share of the directions above the horizon that end within the place: from there it is indoors
 SMALL_M = 4.0  # an outdoor place that is smaller is an object
 
@@ -27,7 +28,8 @@ def enclosed(gaussians: Gaussians, eyes: torch.Tensor, kind: ColliderKind, body:
     cells solid that no flood from the first reaches.
 
     open:    what the Gaussians fill, and no more.
-    indoor:  floors go on where they have holes, up to BEYOND_M; farther on, where the place ends, an invisible wall stands.
+    indoor:  floors go on where they have holes, up to BEYOND_M; farther on, where the place ends, an invisible wall stands. A body
+             below the first of the eyes is free, and small groups of cells that touch nothing else are no obstacles.
     outdoor: the same, but floors go on to the end of the grid.
     object:  the flood begins outside, so that the object is solid; it stands on a level floor.
     """
@@ -40,7 +42,9 @@ def enclosed(gaussians: Gaussians, eyes: torch.Tensor, kind: ColliderKind, body:
         solid[:, :, : ground + 1], top[:, :, ground] = True, float(place.origin[2]) + cell * (ground + 1)
         reached = flood(~solid, np.array([0, 0, solid.shape[2] - 1]))
         return _closed(place, ~reached, top)
-    place = floored(carved(place, gaussians, eyes, body), seed, body, math.inf if kind == "outdoor" else BEYOND_M)
+    place = carved(_cleared(place, seed, body), gaussians, eyes, body)
+    place = replace(place, solid=torch.from_numpy(without_islands(place.solid.numpy(), ISLAND)))
+    place = floored(place, seed, body, math.inf if kind == "outdoor" else BEYOND_M)
     solid, top = place.solid.numpy(), place.top.numpy()
     start = place.cell_of(seed)
     wide = ~spread(solid, _ball(GAP_CELLS))
@@ -49,6 +53,19 @@ def enclosed(gaussians: Gaussians, eyes: torch.Tensor, kind: ColliderKind, body:
     cells = np.argwhere(wide)
     reached = spread(flood(wide, cells[np.argmin(((cells - start) ** 2).sum(1))]), _ball(GAP_CELLS)) & ~solid
     return _closed(place, ~reached, top)
+
+
+def _cleared(place: Occupancy, seed: torch.Tensor, body: Walker) -> Occupancy:
+    """The grid with a body free that stands below the point `seed` [3], for one begins there: whatever is solid, as haze is in
+    fits, from a step above its feet to its head."""
+    eye = standing(place, seed, body)
+    x, y, z = (
+        side + place.cell_m * (torch.arange(count) + 0.5) - at
+        for side, count, at in zip(place.origin, place.solid.shape, eye)
+    )
+    near = (x[:, None].square() + y.square()).sqrt() < body.radius_m + 0.75 * place.cell_m
+    tall = (z > body.step_m - body.eye_m) & (z < body.head_m + 0.5 * place.cell_m)
+    return replace(place, solid=place.solid & ~(near[..., None] & tall))
 
 
 def _closed(place: Occupancy, solid: np.ndarray, top: np.ndarray) -> Occupancy:

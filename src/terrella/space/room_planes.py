@@ -21,6 +21,8 @@ CEILING_M, BEHIND_M = (
 OUTER = 0.35  # share of the strongest peak from which the outermost one is a wall
 WALLS, BLOCK = (0, 1, 3, 4), 20  # planes; cells of a block of colours that is repeated
 OUTERMOST = 0.85  # quantile of a surface's distance that is taken for its plane: rather too far than within free space
+BULGE_M = 0.5  # metres from what was seen over which a plane bends outwards
+BULGE_STEPS = 3  # of the search for where a ray meets such a plane
 FACING = 0.9  # cosine between a surface's normal and a plane's
 
 
@@ -35,6 +37,7 @@ class RoomPlanes:
     colours: tuple[
         torch.Tensor, ...
     ]  # of each plane [rows, columns, 3] in 0..1: y (or z) by x (or y) in cells from the low corner
+    bulges: tuple[torch.Tensor, ...]  # of each plane [rows, columns]: by how many metres its cells lie farther out
 
     @property
     def turn(self) -> torch.Tensor:
@@ -46,19 +49,22 @@ class RoomPlanes:
         """How many times `ways` [N, 3] lead from `eye` [3] to the box, and the colours [N, 3] there."""
         turn = self.turn
         at, ways = eye @ turn, ways @ turn
-        to = torch.where(ways > 0, self.high, self.low)
-        reach = torch.where(ways.abs() > 1e-6, (to - at) / torch.where(ways == 0, 1e-6, ways), torch.inf)
-        far, axis = reach.clamp_min(0.05).min(1)
-        spot = at + far[:, None] * ways
-        plane = axis + 3 * (ways.gather(1, axis[:, None])[:, 0] > 0)
-        colour = torch.zeros(len(ways), 3)
-        for number, picture in enumerate(self.colours):
-            mine = plane == number
-            row, column = (
-                ((spot[mine, k] - self.low[k]) / CELL_M).long().clamp(0, size - 1)
-                for k, size in zip(_axes(number), picture.shape[:2])
-            )
-            colour[mine] = picture[row, column]
+        far, colour = torch.full((len(ways),), torch.inf), torch.zeros(len(ways), 3)
+        for plane, (picture, bulge) in enumerate(zip(self.colours, self.bulges)):
+            axis, side = plane % 3, 1.0 if plane > 2 else -1.0
+            mine = (side * ways[:, axis] > 1e-6).nonzero()[:, 0]
+            to, way = (self.high if plane > 2 else self.low)[axis] - at[axis], ways[mine]
+            reach, cell = to / way[:, axis], (torch.zeros(0), torch.zeros(0))
+            for _ in range(BULGE_STEPS):
+                spot = at + reach.clamp_min(0.05)[:, None] * way
+                cell = tuple(
+                    ((spot[:, k] - self.low[k]) / CELL_M).long().clamp(0, size - 1)
+                    for k, size in zip(_axes(plane), bulge.shape)
+                )
+                reach = (to + side * bulge[cell]) / way[:, axis]
+            nearer = reach.clamp_min(0.05) < far[mine]
+            far[mine[nearer]] = reach.clamp_min(0.05)[nearer]
+            colour[mine[nearer]] = picture[cell][nearer]
         return far, colour
 
 
@@ -67,22 +73,28 @@ def _axes(plane: int) -> tuple[int, int]:
     return ((2, 1), (2, 0), (1, 0))[plane % 3]
 
 
-def room_planes(known: Gaussians, eye: torch.Tensor) -> RoomPlanes:
-    """The box around `eye` [3] of the Gaussians that are known."""
+def room_planes(known: Gaussians, eye: torch.Tensor, error: float = 0.0) -> RoomPlanes:
+    """The box around `eye` [3] of the Gaussians that are known. error: the expected error of their depth, as a share of it; away
+    from where a plane was seen it lies this much farther out, so that what is invented does not fill space that may be free."""
     some = known.at(known.opacities > 0.3)
     some = some.at(torch.arange(0, len(some), max(len(some) // 150_000, 1)))
     turns = rotation(torch.cat([some.means, some.quats], 1))
     normals = turns.gather(2, some.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[..., 0]
     area = some.scales.sort(1).values[:, 1:].prod(1) * 2.6 * max(len(known) / max(len(some), 1), 1)
     heading = _heading(normals, area)
-    box = RoomPlanes(heading, torch.zeros(3), torch.zeros(3), (), ())
+    box = RoomPlanes(heading, torch.zeros(3), torch.zeros(3), (), (), ())
     points, normals, at = some.means @ box.turn, normals @ box.turn, eye @ box.turn
     bounds = [_bound(points, normals, area, at, plane) for plane in range(6)]
     reach = torch.quantile(points[:: max(len(points) // 100_000, 1)], torch.tensor([0.02, 0.98]), dim=0)
     ends = [_unseen(bounds, reach, at, plane) if one is None else one for plane, one in enumerate(bounds)]
     low, high = torch.tensor(ends[:3]), torch.tensor(ends[3:])
-    pictures = _pictures(points, normals, some.colours, low, high)
-    return RoomPlanes(heading, low, high, tuple(one is not None for one in bounds), pictures)
+    pictures, known_cells = _pictures(points, normals, some.colours, low, high)
+    measured, apart = tuple(one is not None for one in bounds), torch.cat([at - low, high - at])
+    bulges = [
+        error * was * far * (_nearest(cells)[0] * CELL_M / BULGE_M).clamp(0, 1)
+        for was, far, cells in zip(measured, apart, known_cells)
+    ]
+    return RoomPlanes(heading, low, high, measured, pictures, tuple(bulges))
 
 
 def _heading(normals: torch.Tensor, area: torch.Tensor) -> float:
@@ -125,8 +137,11 @@ def _unseen(bounds: list[float | None], reach: torch.Tensor, at: torch.Tensor, p
     return min(float(at[axis]) - behind, float(reach[0, axis]) - 0.1)
 
 
-def _pictures(points, normals, colours, low: torch.Tensor, high: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """The colours of the six planes: those of near surfaces; beside them their mirror image; far from them the usual colour."""
+def _pictures(
+    points, normals, colours, low: torch.Tensor, high: torch.Tensor
+) -> tuple[tuple[torch.Tensor, ...], list[torch.Tensor]]:
+    """The colours of the six planes (those of near surfaces; beside them their mirror image; far from them the usual colour), and
+    which cells near surfaces give."""
     pictures, known, usual = [], [], []
     for plane in range(6):
         axis, end = plane % 3, (high if plane > 2 else low)[plane % 3]
@@ -149,7 +164,7 @@ def _pictures(points, normals, colours, low: torch.Tensor, high: torch.Tensor) -
     best = max(WALLS, key=lambda plane: int(known[plane].sum()))
     sources = [best if plane in WALLS else plane for plane in range(6)]
     tiles = [_tile(pictures[source], known[source], one) for source, one in zip(sources, middle)]
-    return tuple(_continued(*part) for part in zip(pictures, known, tiles))
+    return tuple(_continued(*part) for part in zip(pictures, known, tiles)), known
 
 
 def _tile(picture: torch.Tensor, known: torch.Tensor, usual: torch.Tensor) -> torch.Tensor:
@@ -176,17 +191,25 @@ def _repeated(tile: torch.Tensor, shape: torch.Size) -> torch.Tensor:
 
 def _continued(picture: torch.Tensor, known: torch.Tensor, tile: torch.Tensor) -> torch.Tensor:
     """A picture [h, w, 3] whose unknown cells are filled: near the known by its mirror image, farther by the tile."""
-    cells, rest, usual = known.nonzero(), (~known).nonzero(), _repeated(tile, picture.shape)
-    shown = picture.clone()
-    if not len(cells):
+    usual = _repeated(tile, picture.shape)
+    if not bool(known.any()):
         return usual
-    last = torch.tensor(known.shape) - 1
-    for part in rest.split(2048):
-        far, nearest = torch.cdist(part.float(), cells.float()).min(1)
-        at = cells[nearest]
-        mirror = (2 * at - part).clamp_min(0).minimum(last)
-        source = torch.where(known[mirror[:, 0], mirror[:, 1]][:, None], mirror, at)
-        share = (far * CELL_M / FAR_M).clamp(0, 1)[:, None]
-        row, column = part.unbind(1)
-        shown[row, column] = (1 - share) * picture[source[:, 0], source[:, 1]] + share * usual[row, column]
+    far, nearest = _nearest(known)
+    row, column = (~known).nonzero(as_tuple=True)
+    at, part = nearest[row, column], torch.stack([row, column], 1)
+    mirror = (2 * at - part).clamp_min(0).minimum(torch.tensor(known.shape) - 1)
+    source = torch.where(known[mirror[:, 0], mirror[:, 1]][:, None], mirror, at)
+    share = (far[row, column] * CELL_M / FAR_M).clamp(0, 1)[:, None]
+    shown = picture.clone()
+    shown[row, column] = (1 - share) * picture[source[:, 0], source[:, 1]] + share * usual[row, column]
     return shown
+
+
+def _nearest(known: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """For each cell of `known` [h, w] the distance to the nearest one that is, in cells [h, w], and that one [h, w, 2]."""
+    cells, every = known.nonzero(), torch.ones_like(known).nonzero()
+    if not len(cells):
+        return torch.full(known.shape, torch.inf), every.view(*known.shape, 2)
+    pairs = [torch.cdist(part.float(), cells.float()).min(1) for part in every.split(2048)]
+    far, at = torch.cat([one.values for one in pairs]), torch.cat([cells[one.indices] for one in pairs])
+    return far.view(known.shape), at.view(*known.shape, 2)

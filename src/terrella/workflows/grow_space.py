@@ -41,6 +41,7 @@ from .splat_places import SpaceResult, open_splat
 GROWN = "grown"  # the folder in a place where its steps lie
 EYES = 6  # points from which the coverage is measured
 LEAST_ADDED = 20  # Gaussians: with fewer a step adds nothing
+MOST_ERROR, DEVIATION = 0.3, 1.25  # expected error at most; the standard deviation over it, of a normal distribution
 AWAY = 90.0  # degrees that a step must look away from the start before a return counts
 
 
@@ -150,7 +151,15 @@ def fill_of(place: SplatWorld, config: GrowSpaceConfig) -> Fill:
     if config.fill == "lifter":
         return lifted_fill(load_lifter())
     seen = place.gaussians.at(place.provenance == OBSERVED)
-    return planar_fill(room_planes(seen if len(seen) else place.gaussians, place.starts[0, :3]))
+    return planar_fill(
+        room_planes(seen if len(seen) else place.gaussians, place.starts[0, :3], DEVIATION * depth_error(place))
+    )
+
+
+def depth_error(place: SplatWorld) -> float:
+    """The expected error of a place's depth, as a share of it, at most MOST_ERROR: what `space lift` noted; otherwise 0."""
+    given = place.card.get("depth_error")
+    return min(float(given), MOST_ERROR) if isinstance(given, int | float) and given > 0 else 0.0
 
 
 def _looked_at(view: GrowthView, eyes: torch.Tensor) -> torch.Tensor:

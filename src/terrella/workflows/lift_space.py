@@ -133,7 +133,8 @@ def panorama_place(layers: PanoramaLayers, name: str, card: dict, collider: Coll
     starts = planar_pose(torch.zeros(8), torch.zeros(8), high, torch.arange(8) * (math.pi / 4))
     origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
     config = SplatConfig((0.5, 0.5 * 4 / 3, 0.5, 0.5), (192, 256), body=_walker(layers.height_m), collider=collider)
-    return SplatWorld(name, gaussians, origin, starts, config, card | {"axes": AXES})
+    facts = {"axes": AXES, "depth_error": round(float(layers.error.mean()), 3)}
+    return SplatWorld(name, gaussians, origin, starts, config, card | facts)
 
 
 def place_of(layers: PictureLayers, name: str, card: dict, collider: ColliderKind = "indoor") -> SplatWorld:
@@ -146,7 +147,7 @@ def place_of(layers: PictureLayers, name: str, card: dict, collider: ColliderKin
     share = 256 / max(height, width)
     size = (max(round(height * share), 8), max(round(width * share), 8))
     origin = torch.where(seen, OBSERVED, INVENTED).to(torch.uint8)
-    facts = {"axes": AXES, "fov_deg": round(_fov(layers), 1)}
+    facts = {"axes": AXES, "fov_deg": round(_fov(layers), 1), "depth_error": round(float(layers.error.mean()), 3)}
     config = SplatConfig(layers.camera, size, body=_walker(layers.height_m), collider=collider)
     return SplatWorld(name, gaussians, origin, layers.pose[None], config, card | facts)
 

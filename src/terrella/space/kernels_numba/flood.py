@@ -58,6 +58,32 @@ def spread(marked, ball):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def without_islands(solid, fewest):
+    """The cells `solid` bool [X, Y, Z] without groups of fewer than `fewest` that touch each other, at corners too."""
+    kept, seen = solid.copy(), np.zeros(solid.shape, np.bool_)
+    group = np.empty((solid.size, 3), np.int32)
+    for i in range(solid.shape[0]):
+        for j in range(solid.shape[1]):
+            for k in range(solid.shape[2]):
+                if not solid[i, j, k] or seen[i, j, k]:
+                    continue
+                group[0], seen[i, j, k] = (i, j, k), True
+                first, count = 0, 1
+                while first < count:
+                    a, b, c = group[first]
+                    first += 1
+                    for d in range(max(a - 1, 0), min(a + 2, solid.shape[0])):
+                        for e in range(max(b - 1, 0), min(b + 2, solid.shape[1])):
+                            for f in range(max(c - 1, 0), min(c + 2, solid.shape[2])):
+                                if solid[d, e, f] and not seen[d, e, f]:
+                                    group[count], seen[d, e, f] = (d, e, f), True
+                                    count += 1
+                for n in range(count if count < fewest else 0):
+                    kept[group[n, 0], group[n, 1], group[n, 2]] = False
+    return kept
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _highest(column, first, last):
     """The highest solid cell of a column from `first` down to `last`; -1 without one."""
     for k in range(min(first, len(column) - 1), max(last, 0) - 1, -1):
