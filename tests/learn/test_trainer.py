@@ -400,6 +400,15 @@ def test_the_steps_that_there_will_be_are_said_once_as_soon_as_the_pace_is_known
     trainer_in(tmp_path / "c", 10**9, Slow(), strip_every_s=5.0, hours=60 / 3600).train(lambda: passes(2), said.append)
     assert said == [15, 12, 12], "pictures take their time, too"
 
+    class Compiling(Slow):
+        def losses(self, batch, now):
+            passes(20.0 * (now.step == 0))
+            yield from super().losses(batch, now)
+
+    monkeypatch.setattr(module.Trainer, "_waits", False)  # as on a GPU
+    trainer_in(tmp_path / "d", 10**9, Compiling(), hours=60 / 3600).train(paced=said.append)
+    assert said == [15, 12, 12, 10], "the first step alone is compiled"
+
 
 def test_a_stage_takes_at_most_its_share(tmp_path):
     budget = Budget(tmp_path, 2.0)

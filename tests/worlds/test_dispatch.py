@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import terrella
 from terrella.core import chance, make_rng
@@ -120,3 +121,26 @@ def test_waits_crossings_and_masks_are_counted():
     with Dispatches("meta") as count:
         some.to("meta") + 1
     assert count.crossings == 1 and count.kernels == 2 and "2 kernels" in str(count)
+
+
+class Collisions(TorchDispatchMode):
+    """The largest part of the points of a scatter that fall into one cell: a GPU takes these one after the other."""
+
+    most, scatters = 0.0, 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        if "scatter_reduce" in str(function):
+            self.scatters += 1
+            for cells in args[2]:
+                self.most = max(self.most, int(cells.bincount().max()) / max(len(cells), 2048))
+        return function(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", ["doom-maze", "doom-corridor"])
+def test_points_out_of_view_do_not_wait_for_one_cell(name):
+    world, rng = terrella.load(name), make_rng(0)
+    with tensor_programs():
+        state, action = world.start(1, rng), world.spec.sample_action(1, rng)
+        with Collisions() as seen:
+            world.render(world.imagine(state, action, rng), ["rgb"])
+    assert seen.scatters and seen.most < 0.02

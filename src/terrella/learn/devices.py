@@ -4,6 +4,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -64,6 +65,17 @@ def yield_cores() -> None:
     """Sets PyTorch to one thread where other processes use all cores: its threads would wait for each other."""
     if os.getloadavg()[0] > BUSY * (os.cpu_count() or 1):
         torch.set_num_threads(1)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Inside, PyTorch computes in one thread: with small tensors, on busy cores, threads wait for each other."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Captured:

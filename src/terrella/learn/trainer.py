@@ -198,10 +198,12 @@ class Trainer:
             self.save()  # to go back to from what is not a number
         began = saved = drawn = looked = time.monotonic()
         before, first = facts["seconds"], self.steps_done
+        timed = (began, first) if self._waits else None  # since when the pace counts, and the steps then
         while not self.finished and not stop.is_set():
             if not self._completed_step():
                 continue
             now = time.monotonic()
+            timed = timed or (now, self.steps_done)  # on a GPU the first batch is compiled
             facts["seconds"] = before + now - began
             if self.finished and not self._settled():
                 began = now - facts["seconds"] + before  # the time since the last save is taken again
@@ -217,10 +219,10 @@ class Trainer:
             if draw is not None and now - drawn > run.strip_every_s:
                 draw()
                 drawn = time.monotonic()
-            if paced is not None and (drawn > began or now - began > PACE_S):
-                spent_s = time.monotonic() - began
-                at_pace = (self.limit_s - before) * (self.steps_done - first) / spent_s
-                paced(min(self.batches * self.strides, first + int(at_pace)))
+            if paced is not None and (drawn > began or now - began > PACE_S) and self.steps_done > timed[1]:
+                per_s = (self.steps_done - timed[1]) / (time.monotonic() - timed[0])
+                left_s = self.limit_s - before - (timed[0] - began)
+                paced(min(self.batches * self.strides, timed[1] + int(left_s * per_s)))
                 paced = None
         self._settled()
         self.save()

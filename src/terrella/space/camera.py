@@ -13,6 +13,7 @@ from ..core.backend import constant, table
 Intrinsics = tuple[float, float, float, float]
 
 NEAR_M = 0.05  # nearer surfaces are not drawn
+OUTSIDE = 1024  # cells of a z-buffer that take what is out of view
 FAR_M = 100.0  # the depth of pixels where nothing is known
 SAME = 0.06  # depths that differ by less than this share belong to one surface
 
@@ -108,6 +109,12 @@ def pixels_at(places: torch.Tensor, size: Sequence[int]) -> tuple[torch.Tensor, 
 def _last(height: int, width: int) -> torch.Tensor:
     """The largest coordinates that lie in a picture."""
     return torch.nextafter(torch.tensor([float(width), float(height)]), torch.zeros(2))
+
+
+def cells_outside(count: int, end: float) -> torch.Tensor:
+    """For each of `count` points one of the OUTSIDE last cells before `end`, which takes the point if it is out of view. All in a
+    single cell would be taken by a GPU one after the other."""
+    return end - 1 - torch.arange(count) % OUTSIDE
 
 
 def relative_pose(body: torch.Tensor, camera: torch.Tensor) -> torch.Tensor:

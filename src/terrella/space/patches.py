@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core.backend import constant, kernels_do, table, where
-from .camera import FAR_M, NEAR_M, Intrinsics, rotation, unproject
+from .camera import FAR_M, NEAR_M, OUTSIDE, Intrinsics, cells_outside, rotation, unproject
 from .kernels_numba.surfaces import lift
 from .views import arrays, each_view
 
@@ -132,17 +132,17 @@ def cast(
     anchored, start = torch.addcmul(along, products[..., 2], row[..., None]), torch.add(column, row, alpha=width)
     single = [part[..., None] for part in (lift, start, shape[..., 0], area)]
     boxes = torch.cat([anchored, products.flatten(2), *single], -1)
-    canvas = pose.new_full((batch, height * width + 1), FAR_M)
+    canvas = pose.new_full((batch, height * width + OUTSIDE), FAR_M)
     most = max((many for many, _ in steps if many < count), default=0)
     largest = area.topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
     for many, tried in steps:
         part = boxes if many >= count else boxes.gather(1, largest[:, :many])
         _cast_boxes(part, width, min(tried, height * width), canvas)
-    return canvas[:, :-1].view(batch, height, width)
+    return canvas[:, :-OUTSIDE].view(batch, height, width)
 
 
 def _cast_boxes(boxes: torch.Tensor, width: int, pixels: int, canvas: torch.Tensor) -> None:
-    """Lowers `canvas` [B, H * W + 1] at the first `pixels` pixels of the boxes [B, n, 16] of patches."""
+    """Lowers `canvas` [B, H * W + OUTSIDE] at the first `pixels` pixels of the boxes [B, n, 16] of patches."""
     number = constant(torch.arange, boxes.device, float(pixels))
     lift, start, wide, area = boxes[..., 12:].unsqueeze(3).unbind(2)
     row = torch.div(number, wide, rounding_mode="floor")
@@ -153,7 +153,8 @@ def _cast_boxes(boxes: torch.Tensor, width: int, pixels: int, canvas: torch.Tens
     far = lift / ratios[:, :, 0]
     inside = torch.linalg.vector_norm(ratios[:, :, 1:], torch.inf, dim=2) <= ratios[:, :, 0]
     hit = inside & (far > NEAR_M) & (number < area)
-    pixel = where(hit, torch.add(column, row, alpha=width) + start, canvas.shape[1] - 1.0).long()
+    aside = constant(cells_outside, boxes.device, hit.shape[1] * pixels, float(canvas.shape[1])).view(hit.shape[1:])
+    pixel = torch.where(hit, torch.add(column, row, alpha=width) + start, aside).long()
     canvas.scatter_reduce_(1, pixel.flatten(1), far.flatten(1), "amin")
 
 

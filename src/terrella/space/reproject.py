@@ -4,12 +4,14 @@ Keyframes that see another surface at a pixel are masked there."""
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import constant, kernels_do, where
+from ..core.backend import constant, kernels_do
 from .camera import (
     FAR_M,
     NEAR_M,
+    OUTSIDE,
     SAME,
     Intrinsics,
+    cells_outside,
     grid_intrinsics,
     pixel_intrinsics,
     pixels_at,
@@ -34,10 +36,11 @@ def splat_depth(
     height, width = size
     at, depth = project(points, pose, pixel_intrinsics(camera, size), turn)
     pixel, inside = pixels_at(at, size)
-    pixel = where(inside & (depth > 0.05), pixel, height * width)  # the last cell collects what is out of view
-    canvas = depth.new_full((len(points), height * width + 1), FAR_M)
+    aside = constant(cells_outside, depth.device, depth.shape[1], height * width + OUTSIDE)
+    pixel = torch.where(inside & (depth > 0.05), pixel, aside)
+    canvas = depth.new_full((len(points), height * width + OUTSIDE), FAR_M)
     canvas.scatter_reduce_(1, pixel, depth, "amin")
-    return canvas[:, :-1].view(-1, height, width)
+    return canvas[:, :-OUTSIDE].view(-1, height, width)
 
 
 def least_around(plane: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
 from ..data import Dataset, RecordOptions
 from ..data.recording import LONGEST
-from ..learn.devices import describe_device, yield_cores
+from ..learn.devices import describe_device, one_thread, yield_cores
 from ..learn.presets import PresetName
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
@@ -236,7 +236,8 @@ class _Learning:
 
         options = RecordOptions(max_episode_steps=schedule.facts["longest"], pictures=storage_of(world.spec))
         policy = policy_of(self.config.policy, world.spec, world) if self.config.policy else None
-        explore(world, out, frames, self.config.seed, counted, options, policy, enough=enough)
+        with one_thread():
+            explore(world, out, frames, self.config.seed, counted, options, policy, enough=enough)
         dataset = Dataset(out)
         if dataset.length < min(FEWEST_FRAMES, frames):
             raise DatasetError(

@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 from ..core.errors import DatasetError, TerrellaError, TrainingError
 from ..core.world import World, make_rng
 from ..data import RecordOptions
+from ..learn.devices import one_thread
 from ..learn.recipes.video import TrainConfig, TrainingPace, time_training
 from .collect import explore, storage_of
 
@@ -50,7 +51,8 @@ def time_environment(world: World, seed: int, config: TrainConfig) -> Pace | Non
 
         options = RecordOptions(max_episode_steps=TRIAL_STEPS, pictures=storage_of(world.spec))
         try:
-            explore(world, Path(folder), TRIAL_FRAMES, seed, counted, options, enough=enough)
+            with one_thread():
+                explore(world, Path(folder), TRIAL_FRAMES, seed, counted, options, enough=enough)
             frames_per_s = rows / (time.monotonic() - began)
             return Pace(frames_per_s, time_training(folder, config, TRIAL_S))
         except (DatasetError, TrainingError):
