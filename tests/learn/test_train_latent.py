@@ -15,7 +15,16 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import DatasetError, TrainingError
 from terrella.core.rollouts import advance
 from terrella.data import Recorder
-from terrella.learn.latent_validation import ARMS, effective_rank, encode_rows, linear_probe, state_at, verdict
+from terrella.learn.latent_validation import (
+    ARMS,
+    calibrate,
+    effective_rank,
+    encode_rows,
+    linear_probe,
+    open_loop,
+    state_at,
+    verdict,
+)
 from terrella.learn.objectives.latent_prediction import sigreg
 from terrella.learn.recipes import latent
 from terrella.learn.recipes.latent import LatentTraining, train_latent
@@ -147,6 +156,16 @@ def test_its_uncertainty_grows_with_what_was_not_seen(run):
         state = world.imagine(state, torch.ones(1, 1), rng)
         levels.append(float(world.render(state, ("uncertainty",))["uncertainty"]))
     assert levels == sorted(levels) and levels[-1] > levels[1] >= 0
+
+
+def test_its_uncertainty_is_calibrated_as_far_as_the_episodes_reach(run, vectors):
+    """At spreads beyond the last knot the error is extrapolated."""
+    world, data = terrella.load(run[0]), Recording.open(vectors, (64, 64), quiet, needs=("action",))
+    rolled, last_knot = open_loop(world, data, (32,)), {}
+    for longest in (4, 512):
+        calibrate(world, data, longest)
+        last_knot[longest] = float(world.network.spread[-1])
+    assert 2 * last_knot[4] < last_knot[512] and last_knot[512] > float(rolled.spread[32].mean())
 
 
 def test_a_stopped_run_goes_on_exactly(vectors, tmp_path):

@@ -80,6 +80,17 @@ def test_constants_are_recovered(family, estimate, value):
     assert float(known.mean()) == pytest.approx(value, rel=0.02)
 
 
+def test_a_bounce_in_mid_air_does_not_move_gravity():
+    """Balls fall from 50 m and turn round once in mid-air, as predictions do where no floor is."""
+    time_s = 0.02 * torch.arange(24.0)[:, None, None]
+    kick = torch.tensor([0.0, 0.0, 6.0]) * (time_s > 0.2)
+    speed = torch.tensor([0.0, 0.0, -9.81]) * time_s + kick
+    place = torch.tensor([0.0, 0.0, 50.0]) + torch.cat([torch.zeros(1, 1, 3), 0.02 * speed[:-1]]).cumsum(0)
+    motion = trajectory_of(falling(), {"x": place, "v": speed}, 0.02)
+    assert float(motion.velocity[..., 2].diff(dim=0).mean()) / 0.02 > 0, "the mean acceleration points upwards"
+    assert float(gravity(motion)) == pytest.approx(9.81, rel=1e-3)
+
+
 def test_a_constant_that_a_family_does_not_show_is_not_a_number():
     assert gravity(truth("uniform", 1, 200)).isnan().all()
     assert friction(truth("pendulum", 2, 100)).isnan().all()

@@ -19,6 +19,7 @@ from .objectives.uncertainty import rank_correlation
 from .recording import Recording
 
 HORIZONS = (1, 8, 16)
+LONGEST = 512  # steps of the rollouts by which uncertainty is calibrated
 CLIPS = 256  # over which open-loop errors are averaged
 CLEARLY = 0.9  # share of another error below which an error is clearly less
 HELD = 0.5  # R² of a linear probe from which latents hold a vector
@@ -165,10 +166,14 @@ def verdict(errors: Mapping[str, Mapping[str, float]], probe: Mapping[str, float
     return words
 
 
-def calibrate(world: LatentWorld, recording: Recording, horizons: Sequence[int] = (1, 2, 4, 8, 16, 32)) -> None:
+def calibrate(world: LatentWorld, recording: Recording, longest: int = LONGEST) -> None:
     """Fits the map from the spread of the ensemble to the error of the latent, by isotonic regression on half of the held-out
-    clips, in the world's own network."""
-    network, rolled = world.network, open_loop(world, recording, horizons)
+    clips, in the world's own network. Horizons are 1, 2, 4, ... up to `longest` steps, as far as a fifth of the held-out rows
+    reach; the error at larger spreads is extrapolated."""
+    network, data = world.network, held_out_rows(recording)
+    context = network.config.history - 1
+    reach = [len(data.rows_within(context, 2**power, acted=True)) for power in range(longest.bit_length())]
+    rolled = open_loop(world, recording, [2**power for power, rows in enumerate(reach) if rows >= 0.2 * reach[0]])
     spread = torch.cat([rolled.spread[step][::2] for step in rolled.steps]).cpu()
     error = torch.cat([rolled.latent[ARMS[0], step][::2] for step in rolled.steps]).cpu()
     knots, errors = isotonic(spread, error.clamp(0, 1), KNOTS - 1)

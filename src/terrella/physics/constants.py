@@ -25,10 +25,11 @@ class PhysicalConstant:
 
 
 def gravity(motion: Trajectory) -> Tensor:
-    """The mean acceleration of bodies in flight along gravity [B], m/s2."""
+    """The median over steps in flight of the acceleration along gravity [B], m/s2. A bounce in mid-air, as predictions have them,
+    counts as flight, and one of them would move a mean by as much as gravity."""
     down = motion.gravity / motion.gravity.norm().clamp_min(1e-12)
     pull = (motion.velocity.diff(dim=0) @ down) / motion.dt_s
-    return _mean(pull, ballistic(motion) & bool(motion.gravity.norm() > 0))
+    return _median(pull, ballistic(motion) & bool(motion.gravity.norm() > 0))
 
 
 def restitution(motion: Trajectory) -> Tensor:
@@ -76,10 +77,6 @@ CONSTANTS: Mapping[str, PhysicalConstant] = {
 }
 
 
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
-    """The mean of values [T, B, N] where the mask is set [B], NaN where it is nowhere."""
-    return torch.where(mask, values, math.nan).transpose(0, 1).flatten(1).nanmean(1)
-
-
 def _median(values: Tensor, mask: Tensor) -> Tensor:
+    """The median of values [T, B, N] where the mask is set [B], NaN where it is nowhere."""
     return torch.where(mask, values, math.nan).transpose(0, 1).flatten(1).nanmedian(1).values
