@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from terrella.learn.objectives.latent_prediction import sigreg
 from terrella.learn.recipes import latent
 from terrella.learn.recipes.latent import LatentTraining, train_latent
 from terrella.learn.recording import Recording
+from terrella.worlds.latent import LatentWorld
 
 from ..data.layouts import layout_of
 
@@ -90,7 +92,7 @@ def run(vectors, tmp_path_factory):
 def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
     train_latent(vectors, tmp_path, replace(QUICK, rollout=5), quiet)
     world = terrella.load(tmp_path)
-    assert world.spec.leap == 5
+    assert isinstance(world, LatentWorld) and world.spec.leap == 5
     data = Recording.open(vectors, (64, 64), quiet, needs=("action",))
     rows = data.rows_within(2, 5, acted=True)
     state = state_at(world, data, rows, 2)
@@ -161,6 +163,7 @@ def test_its_uncertainty_grows_with_what_was_not_seen(run):
 def test_its_uncertainty_is_calibrated_as_far_as_the_episodes_reach(run, vectors):
     """At spreads beyond the last knot the error is extrapolated."""
     world, data = terrella.load(run[0]), Recording.open(vectors, (64, 64), quiet, needs=("action",))
+    assert isinstance(world, LatentWorld)
     rolled, last_knot = open_loop(world, data, (32,)), {}
     for longest in (4, 512):
         calibrate(world, data, longest)
@@ -187,7 +190,8 @@ def test_a_kill_while_validating_leaves_the_trained_world(vectors, tmp_path, mon
     world = terrella.load(tmp_path)
     assert world.spec.card["steps"] == 6 and "validation" not in world.spec.card
     facts = train_latent(vectors, tmp_path, config, quiet)
-    assert facts["step"] == 6 and terrella.load(tmp_path).spec.card["validation"]["errors"] == facts["errors"]
+    validation: Any = terrella.load(tmp_path).spec.card["validation"]
+    assert facts["step"] == 6 and validation["errors"] == facts["errors"]
 
 
 def test_a_finished_run_says_again_what_it_found(run, vectors):
