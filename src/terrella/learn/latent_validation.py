@@ -176,7 +176,7 @@ def calibrate(world: LatentWorld, recording: Recording, longest: int = LONGEST) 
     rolled = open_loop(world, recording, [2**power for power, rows in enumerate(reach) if rows >= 0.2 * reach[0]])
     spread = torch.cat([rolled.spread[step][::2] for step in rolled.steps]).cpu()
     error = torch.cat([rolled.latent[ARMS[0], step][::2] for step in rolled.steps]).cpu()
-    knots, errors = isotonic(spread, error.clamp(0, 1), KNOTS - 1)
+    knots, errors = isotonic(spread, error, KNOTS - 1)
     network.spread.copy_(F.pad(knots, (1, 0)))
     network.error.copy_(F.pad(errors, (1, 0)))
 
