@@ -226,6 +226,8 @@ def test_what_the_minutes_give_is_said_before_they_are_spent(tmp_path, capsys, m
     monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: Pace(50.0, PACE._replace(step_s=60.0)))
     assert main(command(out)) == 2 and "too few on this machine" in capsys.readouterr().err
     assert not out.exists(), "a refusal leaves nothing"
+    assert "does not compile" not in said
+    assert forecast(Pace(50.0, PACE._replace(compiles=True)), 5, 4000, 220).startswith(said)
 
 
 def test_the_trial_times_a_recording_and_training_steps():

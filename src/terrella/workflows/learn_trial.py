@@ -79,4 +79,7 @@ def forecast(pace: Pace, minutes: float, frames: int, training_s: float) -> str:
             f"{minutes:g} min are too few on this machine, as busy as it is now: {what}, by a trial. Give {better} or more."
         )
     little = f" That is little: {better} trains {FEW_STEPS} steps." if steps < FEW_STEPS else ""
-    return f"Expected in {minutes:g} min, by a trial on this machine: {what}.{little}"
+    compiles = (
+        " The trial does not compile; training does, which takes its time once." if pace.training.compiles else ""
+    )
+    return f"Expected in {minutes:g} min, by a trial on this machine: {what}.{little}{compiles}"

@@ -58,6 +58,7 @@ class TrainingPace(NamedTuple):
     setup_s: float
     step_s: float
     share: float
+    compiles: bool = False  # the training compiles its steps, which the trial does not
 
     def steps_in(self, seconds: float) -> int:
         """The steps for which a run of `seconds` has time."""
@@ -80,7 +81,7 @@ def time_training(data: str | Path, config: TrainConfig, seconds: float) -> Trai
             pace[threads] = trained.new_trainer().time_steps(seconds / len(counts))
         best = min(pace, key=pace.__getitem__)
         torch.set_num_threads(best)
-        return TrainingPace(setup_s, pace[best], 1 - rest)
+        return TrainingPace(setup_s, pace[best], 1 - rest, recipe.plan.device.type == "cuda" and config.compile)
 
 
 def _recipe(
