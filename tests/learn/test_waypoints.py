@@ -17,57 +17,59 @@ COLOURS = {"blue": (30, 60, 220), "green": (30, 150, 50), "red": (220, 30, 30)}
 
 
 def scenes(count, rng):
-    """Pictures of three squares, the number of the one that is named, and its place [count, 2] from -1 to 1."""
+    """Pictures of three squares, the numbers [count, 2] of two that are named, and their places [count, 2, 2] from -1 to 1."""
     corners = np.stack([rng.permutation(16)[:3] for _ in range(count)])
     corners = np.stack([corners // 4, corners % 4], 2) * 6 + rng.integers(0, 3, (count, 3, 2))
     pictures = np.full((count, 24, 24, 3), 120, np.uint8)
     for picture, three in zip(pictures, corners):
         for colour, (y, x) in zip(COLOURS.values(), three):
             picture[y : y + 3, x : x + 3] = colour
-    named = rng.integers(0, 3, count)
-    return torch.from_numpy(pictures), named, torch.from_numpy(corners[np.arange(count), named] / 11.5 - 0.9).float()
+    named = np.stack([rng.permutation(3)[:2] for _ in range(count)])
+    return torch.from_numpy(pictures), named, torch.from_numpy(corners[np.arange(count)[:, None], named] / 11.5 - 0.9)
 
 
-def test_a_waypoint_is_at_the_thing_that_is_named_in_scenes_it_never_saw():
+def test_waypoints_are_at_the_two_things_that_are_named_in_scenes_never_seen():
     torch.manual_seed(0)
     actor = ActorConfig((("rgb", (24, 24, 3)), ("hand", (2,))), "axes", (1,), (-1.0,), (1.0,), hidden=32)
-    network = ImitationNetwork(ImitationConfig(actor, (24, 24), tuple(COLOURS), history=1, waypoint=8))
+    network = ImitationNetwork(ImitationConfig(actor, (24, 24), (*COLOURS, "on"), history=1, waypoint=8))
     objective, rng, count = BehaviourCloning(network, 5e-3), np.random.default_rng(0), 48
     optimiser = objective.learners["imitation"].optimiser
     optimiser.param_groups[0]["lr"] = 5e-3
-    words = network.words.read(list(COLOURS))
 
     def batch():
-        pictures, named, place = scenes(count, rng)
+        pictures, named, places = scenes(count, rng)
+        colours = np.array(list(COLOURS))[named]
+        words = network.words.read([f"{first} on {second}" for first, second in colours])
         seen = {"rgb": pictures, "hand": torch.zeros(count, 2)}
-        still = torch.zeros(count, 1, 1)
-        begins = torch.ones(count)
-        weight = torch.ones(count, 1)
-        return Demonstrations(seen, still, still, weight, words[named], waypoint={"hand": place}, begins=begins)
+        still, weight = torch.zeros(count, 1, 1), torch.ones(count, 1)
+        waypoints = tuple({"hand": places[:, at].float()} for at in (0, 1))
+        return Demonstrations(seen, still, still, weight, words, waypoints=waypoints, begins=torch.ones(count))
 
-    for step in range(80):
+    for step in range(200):
         loss = next(iter(objective.losses(batch(), TrainStep(step, 0.0, torch.device("cpu"), rng, make_rng(step)))))
         optimiser.zero_grad()
         loss.value.backward()
         optimiser.step()
     test = batch()
-    assert test.waypoint is not None
     with torch.no_grad():
         foreseen = network.eval().foreseen(*moments(network, test))
         assert foreseen is not None
-        error = foreseen - network.numbers(test.waypoint)
-    assert set(loss.parts) == {"imitation", "waypoint"}
-    assert error.abs().amax(1).lt(0.25).float().mean() > 0.9  # by chance one in ten
+        errors = foreseen - torch.stack([network.numbers(numbers) for numbers in test.waypoints], 1)
+    assert set(loss.parts) == {"imitation", "waypoint", "end"}
+    near = errors.abs().amax(2).lt(0.25).float().mean(0)
+    assert near.min() > 0.9, near  # by chance one in ten
 
 
-def test_waypoints_are_learned_where_an_episode_begins(tmp_path):
+def test_waypoints_are_learned_where_an_instruction_begins(tmp_path):
     rows, opened = rows_of(Random, tmp_path / "random")
     rows = replace(rows, config=replace(rows.config, waypoint=3))
     place = torch.from_numpy(np.array(opened.cache.arrays["observation.place"], np.float32)).reshape(-1, 1)
     first, stop = opened.cache.episodes[1]
     batch = rows.at(np.array([first, first + 1, stop - 2]))
     assert batch.begins.tolist() == [1, 0, 0]
-    assert torch.equal(batch.waypoint["place"].reshape(-1, 1), place[[first + 3, first + 4, stop - 1]])
+    later, end = (numbers["place"].reshape(-1, 1) for numbers in batch.waypoints)
+    assert torch.equal(later, place[[first + 3, first + 4, stop - 1]])
+    assert torch.equal(end, place[[stop - 1] * 3])
     drawn = rows.sample(400, np.random.default_rng(0))
     assert 0.25 <= drawn.begins.mean() < 0.45  # a quarter, and what is drawn by chance
 
@@ -76,4 +78,4 @@ def test_a_policy_without_pictures_or_instructions_has_no_waypoints():
     numbers = ActorConfig((("hand", (2,)),), "axes", (1,), (-1.0,), (1.0,), hidden=8)
     pictures = replace(numbers, sees=(("rgb", (24, 24, 3)), ("hand", (2,))))
     for actor, words in ((numbers, ("red",)), (pictures, ())):
-        assert ImitationNetwork(ImitationConfig(actor, (24, 24), words, history=1, waypoint=8)).waypoint is None
+        assert not ImitationNetwork(ImitationConfig(actor, (24, 24), words, history=1, waypoint=8)).waypoints

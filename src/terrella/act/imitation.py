@@ -22,7 +22,7 @@ from .choices import Choices
 from .imitation_network import FLOW_STEPS, TEXT, ImitationConfig, ImitationNetwork
 from .sentences import WORDS
 
-KIND, VERSION = "imitation", 3
+KIND, VERSION = "imitation", 4
 _STREAM, _EXPLORATION = 12, 13
 
 

@@ -20,7 +20,7 @@ TEXT = "text"
 LEAST_PICTURE_SIDE = 16  # pixels: smaller arrays [H, W, C] are codes of cells, as those of MiniGrid
 CODES = 32  # values of a code
 CELLS = 4  # side of the pooled feature map of a picture
-QUERIES = 4  # places of a picture to which an instruction attends
+QUERIES = 4  # places of a picture to which an instruction attends, for each of its waypoints
 SHARPNESS = 20.0  # of attention: factor on the cosines of queries and places; plain products never learned to tell colours apart
 FLOW_STEPS = 8  # Euler steps from noise to a chunk
 
@@ -37,7 +37,7 @@ class ImitationConfig:
     chunk: int = 1  # actions that it predicts at once
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
-    waypoint: int = 0  # steps after an instruction began for which it predicts its numbers; 0: not
+    waypoint: int = 0  # steps after an instruction began for which it predicts its numbers, and at its end; 0: not
     differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
@@ -51,6 +51,11 @@ class ImitationConfig:
     def window(self) -> int:
         """Observations from which it acts: with a memory one."""
         return 1 if self.remember else self.history
+
+    @property
+    def waypoints(self) -> int:
+        """Waypoints that it predicts, where it sees pictures, numbers and an instruction: after some steps, and at the end."""
+        return 2 if self.waypoint else 0
 
     @property
     def action_width(self) -> int:
@@ -85,12 +90,12 @@ def is_picture(shape: tuple[int, ...]) -> bool:
 
 class _Look(nn.Module):
     """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018). Of
-    a picture also where each map is largest, and in columns of their own [N, 2 * QUERIES] where the instruction's queries attend
-    to, by cosines."""
+    a picture also where each map is largest, and in columns of their own [N, 2 * queries] where the instruction's queries attend
+    to, by cosines: x of each, then y."""
 
     offset: torch.Tensor
 
-    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: int):
+    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: int, queries: int):
         super().__init__()
         self.picture, self.size = is_picture(shape), size
         channels = shape[2]
@@ -108,7 +113,8 @@ class _Look(nn.Module):
         self.second = nn.Conv2d(last, last, 3, 1, 1)
         attends = words and self.picture
         self.keys = nn.Conv2d(last, last, 1) if attends else None
-        self.queries = nn.Linear(words, QUERIES * last) if attends else None
+        self.queries = nn.Linear(words, queries * last) if attends else None
+        self.count = queries
         self.out = nn.Linear(last * cells, width)
 
     def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
@@ -128,7 +134,7 @@ class _Look(nn.Module):
         pooled = torch.cat([F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)], 1)
         parts = [torch.relu(self.out(pooled))]
         if self.keys is not None and self.queries is not None and words is not None:
-            queries = SHARPNESS * F.normalize(self.queries(words).unflatten(1, (QUERIES, -1)), dim=2)
+            queries = SHARPNESS * F.normalize(self.queries(words).unflatten(1, (self.count, -1)), dim=2)
             keys = F.normalize(self.keys(plain), dim=1)
             parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, keys)))
         return torch.cat(parts, 1)
@@ -145,6 +151,18 @@ def _deviation(numbers: torch.Tensor) -> torch.Tensor:
     """The standard deviation [D] of numbers [N, D]; 1 where they never vary."""
     spread = numbers.std(0, correction=0)
     return torch.where(spread <= 1e-6, 1.0, spread)
+
+
+class _Waypoint(nn.Module):
+    """Places [N, places] to which an instruction attends, and its features [N, words], to numbers [N, width]."""
+
+    def __init__(self, places: int, words: int, hidden: int, width: int):
+        super().__init__()
+        self.of_places = nn.Sequential(nn.Linear(places, hidden), nn.ReLU(), nn.Linear(hidden, width))
+        self.offset = nn.Linear(words, width)
+
+    def forward(self, places: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+        return self.of_places(places) + self.offset(words)
 
 
 class ImitationNetwork(nn.Module):
@@ -168,19 +186,19 @@ class ImitationNetwork(nn.Module):
         if config.differences:
             self.register_buffer("change", torch.ones(width))
             changes = (config.window - 1) * width
-        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words) for _, shape in self._arrays)
-        self.attended = 2 * QUERIES * sum(is_picture(shape) for _, shape in self._arrays) if words else 0
+        queries = QUERIES * max(1, config.waypoints)
+        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words, queries) for _, shape in self._arrays)
+        pictures = sum(is_picture(shape) for _, shape in self._arrays) if words else 0
+        self.attended = 2 * queries * pictures
         self.width = width + actor.hidden * len(self.looks) + self.attended
-        self.waypoint = self.offset = None
-        if foresees := config.waypoint > 0 and width > 0 and self.attended > 0:
-            self.waypoint = nn.Sequential(
-                nn.Linear(self.attended, actor.hidden), nn.ReLU(), nn.Linear(actor.hidden, width)
-            )
-            self.offset = nn.Linear(words, width)
+        foresees = config.waypoints if width and pictures else 0
+        self.waypoints = nn.ModuleList(
+            _Waypoint(2 * QUERIES * pictures, words, actor.hidden, width) for _ in range(foresees)
+        )
         self.memory = nn.GRU(self.width, actor.hidden, batch_first=True) if config.remember else None
         acted = config.window * config.action_width if config.own_actions else 0
         seen = config.window * self.width + (actor.hidden if self.memory else 0) + changes
-        into = seen + acted + words + (config.outcome is not None) + (width if foresees else 0)
+        into = seen + acted + words + (config.outcome is not None) + foresees * width
         flow = actor.mode == AXES
         chunk = config.chunk * (config.action_width if flow else actor.outputs)
         self.trunk = mlp(into, actor.hidden, actor.layers, actor.hidden if flow else chunk, gain=1.0 if flow else 0.1)
@@ -196,12 +214,16 @@ class ImitationNetwork(nn.Module):
         return torch.cat([*parts, *(look[:, :hidden] for look in looks), *(look[:, hidden:] for look in looks)], 1)
 
     def foreseen(self, history: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor | None:
-        """The numbers [N, D], normalised, that it expects `waypoint` steps after an instruction began, from features
-        [N, window, width]; None where it predicts none. Of the pictures it knows nothing but the places to which the instruction
-        attends, so these must be of what is named; the words alone only shift them."""
-        if self.waypoint is None or self.offset is None or words is None:
+        """The numbers [N, waypoints, D], normalised, that it expects `waypoint` steps after an instruction began and at its end,
+        from features [N, window, width]; None where it predicts none. Of the pictures each knows nothing but the places to which
+        its own queries attend, so these must be of what is named; the words alone only shift them."""
+        if not self.waypoints or words is None:
             return None
-        return self.waypoint(history[:, -1, self.width - self.attended : self.width]) + self.offset(words)
+        attended = history[:, -1, self.width - self.attended : self.width]
+        places = attended.view(
+            len(history), -1, len(self.waypoints), QUERIES
+        )  # x and y of each picture, then the waypoint
+        return torch.stack([one(places[:, :, at].flatten(1), words) for at, one in enumerate(self.waypoints)], 1)
 
     def numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """The channels of numbers [N, ...], normalised: [N, D]."""
@@ -242,7 +264,7 @@ class ImitationNetwork(nn.Module):
             parts.append((history[..., : len(self.mean)].diff(dim=1) / self.change).flatten(1))
         parts += [acted.flatten(1)] if self.config.own_actions else []
         parts += [words] if words is not None else []
-        parts += [] if (foreseen := self.foreseen(history, words)) is None else [foreseen]
+        parts += [] if (foreseen := self.foreseen(history, words)) is None else [foreseen.flatten(1)]
         parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []
         return self.trunk(torch.cat(parts, 1))
 

@@ -162,8 +162,9 @@ class DemonstrationRows:
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk = self.actions[torch.from_numpy(ahead)]
-        later = np.minimum(rows + config.waypoint, self.stop[rows] - 1)
-        waypoint = self.observations(later, numbers_only=True) if config.waypoint else None
+        last = self._instructed(rows)[1] - 1
+        later = (np.minimum(rows + config.waypoint, last), last)[: config.waypoints]
+        waypoints = tuple(self.observations(there, numbers_only=True) for there in later)
         begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None
         words, outcome = (
             None if each is None else each[torch.from_numpy(of)].to(self.device)
@@ -171,5 +172,5 @@ class DemonstrationRows:
         )  # fmt: skip
         return Demonstrations(
             seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome,
-            waypoint=waypoint, begins=begins,
+            waypoints=waypoints, begins=begins,
         )  # fmt: skip

@@ -33,7 +33,9 @@ class Demonstrations:
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
     windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
     requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
-    waypoint: Mapping[str, torch.Tensor] | None = None  # numbers [N, ...] some steps later, or at the episode's end
+    waypoints: tuple[
+        Mapping[str, torch.Tensor], ...
+    ] = ()  # numbers [N, ...] some steps later, and at the instruction's end
     begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
 
 
@@ -61,17 +63,18 @@ class BehaviourCloning:
             error = chunk_errors(network, out, batch.chunk)
         loss = (error * batch.weight).sum() / batch.weight.sum().clamp_min(1e-6)
         facts, foreseen = {self.name: loss}, network.foreseen(history, words)
-        if foreseen is not None and batch.waypoint is not None:
-            facts["waypoint"] = waypoint_error(network, foreseen, batch)
+        if foreseen is not None:
+            facts |= zip(("waypoint", "end"), waypoint_errors(network, foreseen, batch))
         yield Loss(self.name, sum(facts.values(), loss * 0), facts)
 
 
-def waypoint_error(network: ImitationNetwork, foreseen: torch.Tensor, batch: Demonstrations) -> torch.Tensor:
-    """The squared error of waypoints [N, D], normalised, at moments at which an instruction begins: later the place of the hand
-    alone tells where it goes."""
-    assert batch.waypoint is not None and batch.begins is not None
-    errors = (foreseen - network.numbers(batch.waypoint)).square().mean(1)
-    return (errors * batch.begins).sum() / batch.begins.sum().clamp_min(1)
+def waypoint_errors(network: ImitationNetwork, foreseen: torch.Tensor, batch: Demonstrations) -> torch.Tensor:
+    """The squared error [waypoints] of waypoints [N, waypoints, D], normalised, at moments at which an instruction begins: later
+    the place of the hand alone tells where it goes."""
+    assert batch.begins is not None
+    truth = torch.stack([network.numbers(numbers) for numbers in batch.waypoints], 1)
+    errors = (foreseen - truth).square().mean(2)
+    return (errors * batch.begins[:, None]).sum(0) / batch.begins.sum().clamp_min(1)
 
 
 def condition(network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor) -> torch.Tensor:

@@ -66,7 +66,7 @@ class Imitation:
     Default: 0, none."""
     waypoint: int = 8
     """A policy of cameras, numbers and instructions predicts what its numbers (the place of its hand) will be this many steps
-    after an instruction began, only from the places to which the instruction attends. 0: not."""
+    after an instruction began and at the instruction's end, only from the places to which the instruction attends. 0: not."""
     outcome: bool = False
     """Condition the policy on the return of the episode and ask for the best: failures teach what not to do."""
 
