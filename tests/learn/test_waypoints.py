@@ -45,7 +45,7 @@ def test_waypoints_are_at_the_two_things_that_are_named_in_scenes_never_seen():
         waypoints = tuple({"hand": places[:, at].float()} for at in (0, 1))
         return Demonstrations(seen, still, still, weight, words, waypoints=waypoints, begins=torch.ones(count))
 
-    for step in range(200):
+    for step in range(80):
         loss = next(iter(objective.losses(batch(), TrainStep(step, 0.0, torch.device("cpu"), rng, make_rng(step)))))
         optimiser.zero_grad()
         loss.value.backward()

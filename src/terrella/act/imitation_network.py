@@ -220,9 +220,8 @@ class ImitationNetwork(nn.Module):
         if not self.waypoints or words is None:
             return None
         attended = history[:, -1, self.width - self.attended : self.width]
-        places = attended.view(
-            len(history), -1, len(self.waypoints), QUERIES
-        )  # x and y of each picture, then the waypoint
+        # Of each picture x and y, of these each waypoint's own queries.
+        places = attended.view(len(history), -1, len(self.waypoints), QUERIES)
         return torch.stack([one(places[:, :, at].flatten(1), words) for at, one in enumerate(self.waypoints)], 1)
 
     def numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:

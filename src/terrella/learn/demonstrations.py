@@ -162,7 +162,7 @@ class DemonstrationRows:
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk = self.actions[torch.from_numpy(ahead)]
-        last = self._instructed(rows)[1] - 1
+        last = np.minimum(self._instructed(rows)[1], self.stop[rows] - 1)
         later = (np.minimum(rows + config.waypoint, last), last)[: config.waypoints]
         waypoints = tuple(self.observations(there, numbers_only=True) for there in later)
         begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None

@@ -33,9 +33,8 @@ class Demonstrations:
     outcome: torch.Tensor | None = None  # [N], the standardised return of the episode
     windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
     requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
-    waypoints: tuple[
-        Mapping[str, torch.Tensor], ...
-    ] = ()  # numbers [N, ...] some steps later, and at the instruction's end
+    waypoints: tuple[Mapping[str, torch.Tensor], ...] = ()
+    """Numbers [N, ...] some steps later, and at the instruction's end."""
     begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
 
 
