@@ -57,6 +57,7 @@ class ImitationActor:
                 "words": torch.zeros(batch, WORDS, dtype=torch.int64),  # of the instruction that is remembered
                 "chunk": torch.zeros(batch, config.chunk, width),
                 "taken": torch.full((batch,), -1),  # actions of the chunk that were taken; -1 at the start
+                "waypoints": torch.zeros(batch, len(self.network.waypoints), len(self.network.mean)),
             }
         )
 
@@ -82,14 +83,18 @@ class ImitationActor:
         else:
             first, features = (memory["taken"] < 0)[:, None, None], features.cpu()
             kept = history = torch.where(first, features, torch.cat([memory["features"][:, 1:], features], 1))
+        begins = (memory["taken"] < 0) | (spoken != memory["words"]).any(1)  # an instruction
+        waypoints, foreseen = memory["waypoints"], network.foreseen(history.to(device), words)
+        if foreseen is not None:
+            waypoints = torch.where(begins[:, None, None], foreseen.cpu(), waypoints)
         seeds = chance.seeds(batch, rng, torch.device("cpu"))
         noise = chance.normal(seeds, (config.chunk * config.action_width,), _STREAM)
         chunk, taken, choices = memory["chunk"], memory["taken"], None
-        anew = (taken < 0) | (taken >= config.execute)
+        anew = begins | (taken >= config.execute)
         if anew.any():
             outcome = None if config.outcome is None else torch.full((batch,), config.outcome, device=device)
             seen = {"history": history.to(device), "acted": memory["acted"].to(device), "words": words}
-            seen["outcome"] = outcome
+            seen |= {"outcome": outcome, "waypoints": waypoints.to(device) if network.waypoints else None}
             out = network(*seen.values())
             if self.std is None:
                 predicted = network.chunk(out, noise.to(device))
@@ -103,6 +108,7 @@ class ImitationActor:
         encoded = chunk[torch.arange(batch), taken]
         acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
         after = {"features": kept, "acted": acted, "words": spoken, "chunk": chunk, "taken": taken + 1}
+        after["waypoints"] = waypoints
         return config.decode(encoded, self.spec), State(after), choices
 
     def unknown(self, text: str) -> tuple[str, ...]:

@@ -254,16 +254,22 @@ class ImitationNetwork(nn.Module):
                 self.change.copy_(_deviation(changes.flatten(0, 1)))
 
     def forward(
-        self, history: torch.Tensor, acted: torch.Tensor, words: torch.Tensor | None, outcome: torch.Tensor | None
+        self,
+        history: torch.Tensor,
+        acted: torch.Tensor,
+        words: torch.Tensor | None,
+        outcome: torch.Tensor | None,
+        waypoints: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """From features [N, window, width], own actions [N, window, A], the instruction's features and the return that is asked
-        for [N]: logits [N, chunk * outputs], or for axes the condition [N, hidden] of the flow."""
+        """From features [N, window, width], own actions [N, window, A], the instruction's features, the return that is asked for
+        [N] and the waypoints [N, waypoints, D] that were expected where the instruction began: logits [N, chunk * outputs], or for
+        axes the condition [N, hidden] of the flow."""
         parts = [history.flatten(1)]
         if self.config.differences:
             parts.append((history[..., : len(self.mean)].diff(dim=1) / self.change).flatten(1))
         parts += [acted.flatten(1)] if self.config.own_actions else []
         parts += [words] if words is not None else []
-        parts += [] if (foreseen := self.foreseen(history, words)) is None else [foreseen.flatten(1)]
+        parts += [waypoints.flatten(1)] if self.waypoints and waypoints is not None else []
         parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []
         return self.trunk(torch.cat(parts, 1))
 

@@ -25,7 +25,7 @@ def copycat(network: ImitationNetwork, rows: DemonstrationRows, count: int) -> d
     predicted = []
     for part in np.array_split(picked, -(-len(picked) // 256)):
         batch = rows.at(part)
-        out = condition(network, batch, batch.acted)
+        out = condition(network, batch, batch.acted, rows.beginnings(part) if network.waypoints else None)
         out = out if batch.requested is None else out[batch.requested]
         noise = torch.zeros(len(part), network.config.chunk * network.config.action_width, device=out.device)
         predicted.append(network.chunk(out, noise)[:, 0].cpu())

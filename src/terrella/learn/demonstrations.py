@@ -15,7 +15,7 @@ from ..data.training.cache import array_for
 from .objectives.imitation import Demonstrations
 from .recording import Recording
 
-BEGINNINGS = 0.25  # part of a batch at which an instruction begins
+BEGINNINGS = 0.375  # part of a batch at which an instruction begins
 CONFIDENCE = "observation.action_confidence"  # of actions that a model named (train inverse)
 
 
@@ -101,6 +101,10 @@ class DemonstrationRows:
             rows[: int(BEGINNINGS * count)] = rng.choice(first, int(BEGINNINGS * count))
         return self.at(rows)
 
+    def beginnings(self, rows: np.ndarray) -> Demonstrations:
+        """The moments at which the instructions of `rows` began."""
+        return self.at(self._instructed(rows)[0])
+
     def _begins(self, rows: np.ndarray) -> np.ndarray:
         """bool [N]: whether an instruction begins at these rows."""
         return self._instructed(rows)[0] == rows
@@ -162,8 +166,9 @@ class DemonstrationRows:
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk = self.actions[torch.from_numpy(ahead)]
-        last = np.minimum(self._instructed(rows)[1], self.stop[rows] - 1)
-        later = (np.minimum(rows + config.waypoint, last), last)[: config.waypoints]
+        began, last = self._instructed(rows)
+        last = np.minimum(last, self.stop[rows] - 1)
+        later = (np.minimum(began + config.waypoint, last), last)[: config.waypoints]
         waypoints = tuple(self.observations(there, numbers_only=True) for there in later)
         begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None
         words, outcome = (

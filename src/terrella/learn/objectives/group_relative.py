@@ -32,7 +32,7 @@ def log_prob(network: ImitationNetwork | ActorNetwork, choices: Choices, std: fl
     inputs, drawn = choices.inputs, choices.drawn
     if isinstance(network, ActorNetwork):
         return network(inputs).log_prob(drawn)
-    out = network(inputs["history"], inputs["acted"], inputs.get("words"), inputs.get("outcome"))
+    out = network(inputs["history"], inputs["acted"], *(inputs.get(key) for key in ("words", "outcome", "waypoints")))
     if network.config.actor.mode != AXES:
         return -chunk_errors(network, out, drawn)[:, : network.config.execute].sum(1)
     times = torch.arange(FLOW_STEPS, device=out.device).repeat(len(out)) / FLOW_STEPS

@@ -34,7 +34,7 @@ class Demonstrations:
     windows: torch.Tensor | None = None  # int64 [windows, T]: the row of `seen` of each moment; `words` are of windows
     requested: torch.Tensor | None = None  # int64 [windows]: the moments that were asked for; None: all
     waypoints: tuple[Mapping[str, torch.Tensor], ...] = ()
-    """Numbers [N, ...] some steps later, and at the instruction's end."""
+    """Numbers [N, ...] some steps after the instruction of the moment began, and at its end."""
     begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
 
 
@@ -51,7 +51,12 @@ class BehaviourCloning:
         hidden = torch.from_numpy(now.rng.random(count) < FORGOTTEN).to(batch.acted.device)
         half = now.half() if any(look.picture for look in network.looks) else FULL
         history, words = moments(network, batch, _shift(now), half)
-        out = network(history, torch.where(hidden[:, None, None], 0.0, batch.acted), words, batch.outcome)
+        foreseen, missed, waypoints = network.foreseen(history, words), (), None
+        if foreseen is not None:
+            truth = torch.stack([network.numbers(numbers) for numbers in batch.waypoints], 1)
+            missed, waypoints = waypoint_errors(foreseen - truth, truth, batch, now)
+        acted = torch.where(hidden[:, None, None], 0.0, batch.acted)
+        out = network(history, acted, words, batch.outcome, waypoints)
         if config.actor.mode == AXES:
             data, out = batch.chunk.flatten(1).repeat(DRAWS, 1), out.repeat(DRAWS, 1)
             time, noise = now.rand(len(data)), now.randn(*data.shape)
@@ -61,25 +66,32 @@ class BehaviourCloning:
         else:
             error = chunk_errors(network, out, batch.chunk)
         loss = (error * batch.weight).sum() / batch.weight.sum().clamp_min(1e-6)
-        facts, foreseen = {self.name: loss}, network.foreseen(history, words)
-        if foreseen is not None:
-            facts |= zip(("waypoint", "end"), waypoint_errors(network, foreseen, batch))
+        facts = {self.name: loss, **dict(zip(("waypoint", "end"), missed))}
         yield Loss(self.name, sum(facts.values(), loss * 0), facts)
 
 
-def waypoint_errors(network: ImitationNetwork, foreseen: torch.Tensor, batch: Demonstrations) -> torch.Tensor:
-    """The squared error [waypoints] of waypoints [N, waypoints, D], normalised, at moments at which an instruction begins: later
-    the place of the hand alone tells where it goes."""
+def waypoint_errors(
+    difference: torch.Tensor, truth: torch.Tensor, batch: Demonstrations, now: TrainStep
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The squared error [waypoints] of waypoints at moments at which an instruction begins, from their differences to the true ones
+    [N, waypoints, D], normalised; later the place of the hand alone tells where it goes. And the waypoints [N, waypoints, D] that
+    the actions are given: true ones with errors drawn from these, for acting keeps those of the beginning."""
     assert batch.begins is not None
-    truth = torch.stack([network.numbers(numbers) for numbers in batch.waypoints], 1)
-    errors = (foreseen - truth).square().mean(2)
-    return (errors * batch.begins[:, None]).sum(0) / batch.begins.sum().clamp_min(1)
+    squares = difference.square().mean(2) * batch.begins[:, None]
+    made = batch.begins.nonzero()[:, 0]
+    drawn = made[torch.from_numpy(now.rng.integers(0, len(made), len(truth)))] if len(made) else None
+    waypoints = truth if drawn is None else truth + difference[drawn].detach()
+    return squares.sum(0) / max(1, len(made)), waypoints
 
 
-def condition(network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor) -> torch.Tensor:
-    """What the network makes of moments: logits, or the condition of the flow."""
+def condition(
+    network: ImitationNetwork, batch: Demonstrations, acted: torch.Tensor, beginnings: Demonstrations | None = None
+) -> torch.Tensor:
+    """What the network makes of moments: logits, or the condition of the flow. beginnings: the moments at which their instructions
+    began, for a network with waypoints."""
     history, words = moments(network, batch)
-    return network(history, acted, words, batch.outcome)
+    waypoints = None if beginnings is None else network.foreseen(*moments(network, beginnings))
+    return network(history, acted, words, batch.outcome, waypoints)
 
 
 def moments(
