@@ -4,14 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from tests.learn.test_imitation_of_a_teacher import rows_of
 
 from terrella.act.actor_network import ActorConfig
+from terrella.act.imitation import ImitationActor
 from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
+from terrella.core.instruction import text_to_bytes
 from terrella.core.policy import Random
+from terrella.core.spec import TEXT as TEXT_SPACE
 from terrella.core.world import make_rng
-from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations, moments
+from terrella.learn.objectives.imitation import BehaviourCloning, Demonstrations, moments, waypoint_errors
 from terrella.learn.train_step import TrainStep
+from terrella.sim.gymnasium import GymnasiumWorld
 
 COLOURS = {"blue": (30, 60, 220), "green": (30, 150, 50), "red": (220, 30, 30)}
 
@@ -72,6 +77,46 @@ def test_waypoints_are_learned_where_an_instruction_begins(tmp_path):
     assert torch.equal(end, place[[stop - 1] * 3])
     drawn = rows.sample(400, np.random.default_rng(0))
     assert 0.375 <= drawn.begins.mean() < 0.575  # three in eight, and what is drawn by chance
+
+
+def test_actions_are_given_the_waypoints_of_the_beginning_until_the_instruction_changes():
+    torch.manual_seed(0)
+    hand, picture = spaces.Box(-1, 1, (2,), np.float32), spaces.Box(0, 255, (24, 24, 3), np.uint8)
+    spec = replace(
+        GymnasiumWorld("Pendulum-v1", rgb=False).spec, channels={"rgb": picture, "hand": hand, "text": TEXT_SPACE}
+    )
+    actor = ActorConfig((("rgb", (24, 24, 3)), ("hand", (2,))), "axes", (1,), (-2.0,), (2.0,), hidden=16)
+    config = ImitationConfig(actor, (24, 24), tuple(COLOURS), history=1, chunk=4, execute=4, waypoint=8)
+    policy = ImitationActor(ImitationNetwork(config).eval(), spec)
+    pictures = scenes(2, np.random.default_rng(0))[0]
+
+    def act(picture, words, memory):
+        text = torch.from_numpy(np.stack([text_to_bytes(word) for word in words]))
+        seen = {"rgb": pictures[[picture, picture]], "hand": torch.zeros(2, 2), "text": text}
+        return policy.act(seen, memory, make_rng(0))[1]
+
+    began = act(0, ("red", "red"), policy.begin(2, make_rng(0)))
+    later = act(1, ("red", "blue"), began)
+    anew = act(1, ("red", "blue"), policy.begin(2, make_rng(0)))
+    assert began["waypoints"].shape == (2, 2, 2)
+    assert later["waypoints"][0].equal(began["waypoints"][0])
+    assert not later["waypoints"][0].equal(anew["waypoints"][0])
+    assert later["waypoints"][1].equal(anew["waypoints"][1])  # the instruction changed
+    assert later["taken"].tolist() == [2, 1]  # and with it the chunk
+
+
+def test_the_errors_of_given_waypoints_are_those_of_beginnings():
+    truth = torch.zeros(6, 2, 3)
+    difference = torch.arange(6.0)[:, None, None].expand(6, 2, 3)
+    begins = torch.tensor([0.0, 1, 0, 0, 1, 0])
+    batch = Demonstrations({}, truth, truth, truth, begins=begins)
+    now = TrainStep(0, 0.0, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
+    squares, given = waypoint_errors(difference, truth, batch, now)
+    assert squares.tolist() == [8.5, 8.5]  # of 1 and 4
+    assert set(given.flatten().tolist()) == {1.0, 4.0}
+    nothing = replace(batch, begins=torch.zeros(6))
+    squares, given = waypoint_errors(difference, truth, nothing, now)
+    assert squares.tolist() == [0, 0] and given.equal(truth)
 
 
 def test_a_policy_without_pictures_or_instructions_has_no_waypoints():
