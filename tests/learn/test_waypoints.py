@@ -37,9 +37,9 @@ def test_waypoints_are_at_the_two_things_that_are_named_in_scenes_never_seen():
     torch.manual_seed(0)
     actor = ActorConfig((("rgb", (24, 24, 3)), ("hand", (2,))), "axes", (1,), (-1.0,), (1.0,), hidden=32)
     network = ImitationNetwork(ImitationConfig(actor, (24, 24), (*COLOURS, "on"), history=1, waypoint=8))
-    objective, rng, count = BehaviourCloning(network, 5e-3), np.random.default_rng(0), 48
+    objective, rng, count = BehaviourCloning(network, 1e-2), np.random.default_rng(0), 48
     optimiser = objective.learners["imitation"].optimiser
-    optimiser.param_groups[0]["lr"] = 5e-3
+    optimiser.param_groups[0]["lr"] = 1e-2
 
     def batch():
         pictures, named, places = scenes(count, rng)

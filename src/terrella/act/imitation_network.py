@@ -95,7 +95,7 @@ class _Look(nn.Module):
 
     offset: torch.Tensor
 
-    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: int, queries: int):
+    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: WordEncoder | None):
         super().__init__()
         self.picture, self.size = is_picture(shape), size
         channels = shape[2]
@@ -109,12 +109,11 @@ class _Look(nn.Module):
             self.register_buffer("offset", torch.arange(channels) * CODES, persistent=False)
             self.first = nn.Sequential(nn.Conv2d(32, 32, 3, 1, 1), nn.ReLU())
             last, cells = 32, shape[0] * shape[1]
-        self.film = nn.Linear(words, 2 * last) if words else None
+        self.film = nn.Linear(words.sentence, 2 * last) if words else None
         self.second = nn.Conv2d(last, last, 3, 1, 1)
-        attends = words and self.picture
+        attends = words is not None and words.pick is not None and self.picture
         self.keys = nn.Conv2d(last, last, 1) if attends else None
-        self.queries = nn.Linear(words, queries * last) if attends else None
-        self.count = queries
+        self.queries = nn.Linear(words.sentence, last) if attends else None  # one for all: a colour is learned once
         self.out = nn.Linear(last * cells, width)
 
     def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
@@ -126,7 +125,7 @@ class _Look(nn.Module):
             features = self.first(self.codes(codes).sum(3).permute(0, 3, 1, 2))
         plain = features
         if self.film is not None and words is not None:
-            scale, shift = self.film(words)[..., None, None].chunk(2, 1)
+            scale, shift = self.film(words[:, : self.film.in_features])[..., None, None].chunk(2, 1)
             features = torch.relu((1 + scale) * features + shift)
         features = torch.relu(self.second(features))
         if not self.picture:
@@ -134,7 +133,8 @@ class _Look(nn.Module):
         pooled = torch.cat([F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)], 1)
         parts = [torch.relu(self.out(pooled))]
         if self.keys is not None and self.queries is not None and words is not None:
-            queries = SHARPNESS * F.normalize(self.queries(words).unflatten(1, (self.count, -1)), dim=2)
+            picks = words.unflatten(1, (-1, self.queries.in_features))[:, 1:]
+            queries = SHARPNESS * F.normalize(self.queries(picks), dim=2)
             keys = F.normalize(self.keys(plain), dim=1)
             parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, keys)))
         return torch.cat(parts, 1)
@@ -175,8 +175,10 @@ class ImitationNetwork(nn.Module):
     def __init__(self, config: ImitationConfig):
         super().__init__()
         self.config, actor = config, config.actor
-        self.words = WordEncoder(config.vocabulary) if config.vocabulary else None
-        words = self.words.width if self.words else 0
+        pictures = sum(is_picture(shape) for _, shape in actor.sees)
+        picks = QUERIES * max(1, config.waypoints) if pictures else 0
+        self.words = WordEncoder(config.vocabulary, picks=picks) if config.vocabulary else None
+        words = self.words.sentence if self.words else 0
         self._vectors = [(name, int(np.prod(shape))) for name, shape in actor.sees if len(shape) < 2]
         self._arrays = [(name, shape) for name, shape in actor.sees if len(shape) == 3]
         width = sum(count for _, count in self._vectors)
@@ -186,12 +188,10 @@ class ImitationNetwork(nn.Module):
         if config.differences:
             self.register_buffer("change", torch.ones(width))
             changes = (config.window - 1) * width
-        queries = QUERIES * max(1, config.waypoints)
-        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, words, queries) for _, shape in self._arrays)
-        pictures = sum(is_picture(shape) for _, shape in self._arrays) if words else 0
-        self.attended = 2 * queries * pictures
+        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, self.words) for _, shape in self._arrays)
+        self.attended = 2 * picks * pictures if words else 0
         self.width = width + actor.hidden * len(self.looks) + self.attended
-        foresees = config.waypoints if width and pictures else 0
+        foresees = config.waypoints if width and self.attended else 0
         self.waypoints = nn.ModuleList(
             _Waypoint(2 * QUERIES * pictures, words, actor.hidden, width) for _ in range(foresees)
         )
@@ -222,7 +222,8 @@ class ImitationNetwork(nn.Module):
         attended = history[:, -1, self.width - self.attended : self.width]
         # Of each picture x and y, of these each waypoint's own queries.
         places = attended.view(len(history), -1, len(self.waypoints), QUERIES)
-        return torch.stack([one(places[:, :, at].flatten(1), words) for at, one in enumerate(self.waypoints)], 1)
+        sentence = words[:, : self.words.sentence] if self.words is not None else words
+        return torch.stack([one(places[:, :, at].flatten(1), sentence) for at, one in enumerate(self.waypoints)], 1)
 
     def numbers(self, seen: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """The channels of numbers [N, ...], normalised: [N, D]."""
@@ -268,7 +269,7 @@ class ImitationNetwork(nn.Module):
         if self.config.differences:
             parts.append((history[..., : len(self.mean)].diff(dim=1) / self.change).flatten(1))
         parts += [acted.flatten(1)] if self.config.own_actions else []
-        parts += [words] if words is not None else []
+        parts += [words[:, : self.words.sentence]] if words is not None and self.words is not None else []
         parts += [waypoints.flatten(1)] if self.waypoints and waypoints is not None else []
         parts += [outcome[:, None]] if self.config.outcome is not None and outcome is not None else []
         return self.trunk(torch.cat(parts, 1))

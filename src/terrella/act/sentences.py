@@ -28,16 +28,19 @@ class SentenceEncoder(Protocol):
 
 class WordEncoder(nn.Module):
     """Embeddings of the words of a vocabulary in their order, pooled by attention. Unknown words are left out; words that are
-    spelled nearly as a known one are that word."""
+    spelled nearly as a known one are that word. Features are those of the sentence [sentence], and `picks` more, each of the words
+    that its own attention picks [picks * sentence]. For that a word's neighbours say what it does: "on the blue block"."""
 
-    def __init__(self, vocabulary: Sequence[str], width: int = 64):
+    def __init__(self, vocabulary: Sequence[str], sentence: int = 64, picks: int = 0):
         super().__init__()
-        self.vocabulary, self.width = tuple(vocabulary), width
+        self.vocabulary, self.sentence, self.width = tuple(vocabulary), sentence, (1 + picks) * sentence
+        width, near = sentence, 3 if picks else 1  # neighbours on either side
         self._numbers = {word: number for number, word in enumerate(self.vocabulary, 1)}
         self.embed = nn.Embedding(len(self.vocabulary) + 1, width, padding_idx=0)
-        self.mix = nn.Conv1d(width, width, 3, padding=1)
+        self.mix = nn.Conv1d(width, width, 2 * near + 1, padding=near)
         self.weigh = nn.Linear(width, 1)
         self.out = nn.Linear(width, width)
+        self.pick = nn.Linear(width, picks) if picks else None
         self._read = lru_cache(maxsize=4096)(self._number)
 
     def read(self, texts: Sequence[str]) -> torch.Tensor:
@@ -61,7 +64,11 @@ class WordEncoder(nn.Module):
         embedded = self.embed(words)
         mixed = torch.relu(embedded + self.mix(embedded.transpose(1, 2)).transpose(1, 2))
         weights = self.weigh(mixed)[..., 0].masked_fill(words == 0, -1e4).softmax(1)
-        return torch.relu(self.out((weights[..., None] * mixed).sum(1)))
+        sentence = torch.relu(self.out((weights[..., None] * mixed).sum(1)))
+        if self.pick is None:
+            return sentence
+        picked = self.pick(mixed).masked_fill((words == 0)[..., None], -1e4).softmax(1)  # [N, words, picks]
+        return torch.cat([sentence, torch.einsum("nwp,nwc->npc", picked, mixed).flatten(1)], 1)
 
     def _number(self, text: str) -> tuple[tuple[str, int], ...]:
         return tuple((word, self._nearest(word)) for word in words_of(text))
