@@ -169,7 +169,7 @@ class DemonstrationRows:
         began, last = self._instructed(rows)
         last = np.minimum(last, self.stop[rows] - 1)
         later = (np.minimum(began + config.waypoint, last), last)[: config.waypoints]
-        waypoints = tuple(self.observations(there, numbers_only=True) for there in later)
+        waypoints = tuple(self.observations(at, numbers_only=True) for at in later)
         begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None
         words, outcome = (
             None if each is None else each[torch.from_numpy(of)].to(self.device)
