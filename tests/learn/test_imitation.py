@@ -117,9 +117,8 @@ def test_an_instruction_is_followed_and_unknown_words_are_named(fetch):
     ]
 
 
-@pytest.mark.parametrize("picks", [0, 4])
-def test_words_mean_the_same_in_other_sentences_and_their_order_counts(picks):
-    encoder = WordEncoder(vocabulary_of(["put the red ball on the blue box"]), picks=picks).eval()
+def test_words_mean_the_same_in_other_sentences_and_their_order_counts():
+    encoder = WordEncoder(vocabulary_of(["put the red ball on the blue box"])).eval()
     asked = "please kindly put the red ball on the box"
     alone, beside = (encoder(encoder.read(texts))[0] for texts in ([asked], [asked, 3 * f"{asked} "]))
     assert torch.allclose(alone, beside, atol=1e-6)  # unknown words cut nothing off

@@ -10,6 +10,7 @@ from tests.learn.test_imitation_of_a_teacher import rows_of
 from terrella.act.actor_network import ActorConfig
 from terrella.act.imitation import ImitationActor
 from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
+from terrella.act.sentences import WordEncoder
 from terrella.core.instruction import text_to_bytes
 from terrella.core.policy import Random
 from terrella.core.spec import TEXT as TEXT_SPACE
@@ -117,6 +118,12 @@ def test_the_errors_of_given_waypoints_are_those_of_beginnings():
     nothing = replace(batch, begins=torch.zeros(6))
     squares, given = waypoint_errors(difference, truth, nothing, now)
     assert squares.tolist() == [0, 0] and given.equal(truth)
+
+
+def test_picks_are_the_same_beside_longer_sentences():
+    encoder = WordEncoder(("blue", "on", "red"), picks=4).eval()
+    alone, beside = (encoder(encoder.read(texts))[0] for texts in (["red on blue"], ["red on blue", 9 * "blue on "]))
+    assert alone.shape == (encoder.width,) and torch.allclose(alone, beside, atol=1e-6)
 
 
 def test_a_policy_without_pictures_or_instructions_has_no_waypoints():
