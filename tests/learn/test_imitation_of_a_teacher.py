@@ -10,10 +10,12 @@ from terrella.act.imitation_network import ImitationNetwork, spatial_softmax
 from terrella.act.teacher import Teacher
 from terrella.core.policy import Random
 from terrella.core.world import make_rng
-from terrella.data import record
+from terrella.data import Dataset, record
 from terrella.learn.copycat import copycat
 from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, config_of, open_demonstrations
+from terrella.learn.recipes.latent import vectors_of
+from terrella.learn.recording import Recording
 from terrella.sim.gymnasium import GymnasiumWorld
 
 
@@ -109,3 +111,14 @@ def test_spatial_softmax_finds_a_dot_between_two_pixels():
     maps[0, 1, 4, 3] = maps[0, 1, 4, 4] = 50.0
     x, y = spatial_softmax(maps).view(2, 2)
     assert torch.allclose(x, torch.tensor([1.0, -0.125])) and torch.allclose(y, torch.tensor([-0.5, 1.0]))
+
+
+def test_no_learner_sees_the_teachers_advice_or_masks_unless_it_names_them(tmp_path):
+    rows_of(Random, tmp_path / "random")
+    recording = Recording.open(
+        Dataset(tmp_path / "random"), (64, 64), quiet, needs=("action",), why="a test"
+    ).require_rows()
+    assert vectors_of(recording) == (("place", 1),)
+    assert vectors_of(recording, ("expert", "place")) == (("expert", 1), ("place", 1))
+    recording.cache.keys["place_mask"] = recording.cache.keys["place"]  # as of a merged recording
+    assert vectors_of(recording) == (("place", 1),)

@@ -14,7 +14,7 @@ from terrella.act.choices import Choices
 from terrella.act.imitation import ImitationActor
 from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
 from terrella.act.planning import PlaySettings, SuccessCriterion, play
-from terrella.core.errors import PlanningError
+from terrella.core.errors import PlanningError, TrainingError
 from terrella.core.world import make_rng
 from terrella.learn.objectives.group_relative import group_advantages, log_prob
 from terrella.learn.recipes.verified import RewardRule, VerifiedPractice, check_rewards, practise_verified
@@ -155,6 +155,12 @@ def test_a_goal_that_leaves_numbers_open_is_the_same_goal_when_it_continues(tmp_
         config = VerifiedPractice(updates=updates, groups=4, group_size=8, noise=0.5)
         facts = practise_verified(world, tmp_path / "before", tmp_path / "run", config, rule, lambda *_: None)
         assert facts["step"] == updates
+    network = imitator(world).network  # another policy at the same place is not practised further in its stead
+    with torch.no_grad():
+        next(network.parameters()).add_(0.1)
+    ImitationActor.write(network, tmp_path / "before", {})
+    with pytest.raises(TrainingError, match="weights of the policy.*another --out"):
+        practise_verified(world, tmp_path / "before", tmp_path / "run", config, rule, lambda *_: None)
 
 
 def test_what_is_never_reached_is_refused_before_training():

@@ -30,6 +30,12 @@ MOST_AXES = 5
 # Of a learned world, so no training data.
 ESTIMATES = ("uncertainty", "drifted", "invented", "known", "places", "keyframes", "hit", "fallen")
 OF_TASK = ("text", "instruction")  # channels that an episode's task holds
+PRIVILEGED = ("expert", "truth", "action_confidence")  # no sensor gives them: seen by learners that name them
+
+
+def usually_seen(channel: str) -> bool:
+    """Whether a learner that names no channels sees this one: neither what no sensor gives, nor the masks of a merged recording."""
+    return channel not in PRIVILEGED and not channel.endswith("_mask")
 
 
 def sensors_of_channels(spec: Spec) -> dict[str, Sensor]:

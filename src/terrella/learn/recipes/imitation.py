@@ -20,7 +20,7 @@ from ...core.errors import DatasetError, TrainingError
 from ...core.similar import did_you_mean
 from ...core.spec import Spec, kind_of
 from ...data import Dataset
-from ...data.channels import ESTIMATES
+from ...data.channels import ESTIMATES, PRIVILEGED, usually_seen
 from ...data.training.cache import array_for
 from ..copycat import copycat
 from ..demonstrations import DemonstrationRows
@@ -41,12 +41,10 @@ NOT_SEEN = {
     "depth",
     "pose",
     "latent",
-    "expert",
-    "truth",
-    "action_confidence",
+    *PRIVILEGED,
     *ESTIMATES,
 }
-NAMED_ONLY = {"pose", "latent", "expert", "truth", "action_confidence"}  # of these, seen by a policy that names them
+NAMED_ONLY = {"pose", "latent", *PRIVILEGED}  # of these, seen by a policy that names them
 DISCRETE_CHUNK, AXES_CHUNK = 1, 8  # default chunk of actions
 TESTED = 2048  # moments of the final test
 
@@ -130,10 +128,9 @@ def open_demonstrations(
     opened = Recording.open(dataset, size, report, needs=needs, why=why, cameras=cameras).require_rows()
     cache = opened.cache
     if not sees:
-        usual = [
-            name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN and _shape(opened, name) is not None
-        ]
-        sees = tuple(name for name in usual if len(_shape(opened, name) or ()) in (0, 1, 3))
+        known = [name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN and usually_seen(name)]
+        shapes = {name: shape for name in known if (shape := _shape(opened, name)) is not None}
+        sees = tuple(name for name, shape in shapes.items() if len(shape) in (0, 1, 3))
     for name in sees:
         if name in NOT_SEEN - NAMED_ONLY or _shape(opened, name) is None:
             known = [name for name in cache.keys if not {name, kind_of(name)} & NOT_SEEN]

@@ -13,6 +13,7 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
 from ...data import Clips, ClipsConfig, Dataset
+from ...data.channels import usually_seen
 from ...worlds.checkpoint import WORLD_FILE
 from ...worlds.folder import save_latent, with_saved_keys
 from ...worlds.latent import LatentWorld
@@ -52,7 +53,7 @@ class LatentTraining:
     pictures: bool = True
     # --no-vectors: observe the recording's pictures alone; the state vectors are predicted, but not observed.
     vectors: bool = True
-    # State vectors of the recording to learn, such as observation. Default: all.
+    # State vectors of the recording to learn, such as observation. Default: all but expert, truth, action_confidence and masks.
     channels: tuple[str, ...] = ()
     # Height and width of pictures, multiples of 16. Default: their own shape, scaled to fit within 64 x 64.
     size: tuple[int, int] | None = None
@@ -147,7 +148,7 @@ def fitted_size(dataset: Dataset) -> tuple[int, int]:
 
 
 def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
-    """(channel, width) of the vectors of a recording, such as state, pose and vitals: all, or those in `wanted`."""
+    """(channel, width) of the vectors of a recording, such as state, pose and vitals: those usually seen, or those in `wanted`."""
     cache, widths = recording.cache, {}
     for channel, key in cache.keys.items():
         array = cache.arrays.get(key)
@@ -164,7 +165,8 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
         raise DatasetError(
             f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(widths)) or 'none'}."
         )
-    return tuple((name, width) for name, width in sorted(widths.items()) if not wanted or name in wanted)
+    chosen = wanted or [name for name in widths if usually_seen(name)]
+    return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
 
 
 class _Training:

@@ -20,6 +20,7 @@ from ...core.errors import PlanningError, TrainingError
 from ...core.world import World, make_rng
 from ...data import Dataset
 from ..objectives.group_relative import GroupRelative
+from ..paired import fingerprint
 from ..recording import Recording
 from ..train_step import TrainStep
 from ..trainer import Report, Run, Trainer
@@ -93,7 +94,7 @@ def practise_verified(
     network = actor.network.requires_grad_(True)
     facts = {"policy": str(policy), "steps of a rollout": steps, "reference": str(rule.reference or ""), "blind": blind}
     goal = {name: str(value.tolist()) for name, value in criterion.goal.items()}  # as text, for NaN is not NaN
-    facts |= {"goal": goal, "within": criterion.within}
+    facts |= {"goal": goal, "within": criterion.within, "weights of the policy": fingerprint(network)}
     run = Run.of(out, config, report, device_of(world), ("minutes", "updates"), success=criterion.channel, **facts)
     starts = WorldStarts(world) if rule.reference is None else _references(world, rule.reference, steps, report)
     feed = VerifiedRollouts(world, actor, starts, criterion, steps, (config.groups, config.group_size), blind)
