@@ -50,8 +50,8 @@ class EnvironmentConfig:
     adapter: str | None = None
     """A Python file (FILE.py or FILE.py:NAME) with an Adapter that finds depth, poses and more."""
     task: str | None = None
-    """A task of a ready robot: `road` or `road:SEED` (another town) of mujoco:car, a task such as `stack` of mujoco:table; the same as
-    the name mujoco:car:road."""
+    """A task of a ready robot: `road` or `road:SEED` (another town) of mujoco:car, `stack` and others of mujoco:table; the same
+    as the name mujoco:car:road."""
     randomise: str | None = None
     """A TOML or JSON file of distributions, from which each episode of a simulator draws masses, friction, delay and more."""
 
