@@ -1,14 +1,16 @@
 """Measures places of panoramas, and places that grow from one picture, against rooms of `space build`, whose geometry is known.
 
-python benchmarks/places.py panorama|grow [--out DIR]
+python benchmarks/places.py panorama|grow|rooms [--out DIR]
 
 panorama: closure (PSNR of the panorama drawn again from its middle), and the error of depth within two pixels of seams, where
 another view begins to weigh most, over that elsewhere: of depth itself after one factor, and of its steps on smooth surfaces.
 
 grow: one picture of a room is lifted, scaled by the median ratio to the truth, and grown. Surface: the share of all directions from
 points in the room's true free space in which the place shows something. Intrusions: steps of which more than INTRUDING of the
-Gaussians lie more than 10 cm within true free space. Revisit: the start's view after all steps against that before. Each also with
-the true depth of the picture in place of the lifter's.
+Gaussians lie more than 10 cm within true free space. Beyond: the median distance by which they lie outside the true room. Revisit:
+the start's view after all steps against that before. Each also with the true depth of the picture in place of the lifter's.
+
+rooms: the same of TEXTS, each with two seeds, with the default fill and the lifter's depth.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -38,18 +41,30 @@ from terrella.workflows.lift_space import place_of
 
 EYE_M, SEED = 1.6, 5
 INTRUDING, FREE_M = 0.05, 0.1
+WALL_M = 0.1  # thickness of the outer walls
 ROOMS = {
     "living room": "a bright scandinavian living room at noon",
     "library": "a cosy library with a red door",
     "empty library": "a library with a red door",
     "dungeon": "a dungeon with torches",
 }
+TEXTS = (
+    "a bright scandinavian living room at noon",
+    "a cosy library with a red door",
+    "a dungeon with torches",
+    "a bright scandinavian kitchen at noon",
+    "a cosy library at night",
+    "a loft with a large window",
+    "a bedroom in the evening",
+    "an office with two windows",
+)
+SEEDS = (5, 11)
 MEASURED = {"panorama": ("living room", "empty library", "dungeon"), "grow": ("living room", "library", "dungeon")}
 
 
-def built(text: str, gaussians: int = 200_000) -> BuiltPlace:
+def built(text: str, gaussians: int = 200_000, seed: int = SEED) -> BuiltPlace:
     """A room that the lifter's training never saw: its words have a seed of their own."""
-    return build(parse_text(text, SEED).layout, gaussians)
+    return build(parse_text(text, seed).layout, gaussians)
 
 
 def to_bytes(rgb: torch.Tensor) -> torch.Tensor:
@@ -101,8 +116,8 @@ def depth_to_solids(points: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def grow(name: str, place: BuiltPlace, out: Path | None, fill: str, exact: bool) -> None:
-    """Figures of one room."""
+def grow(name: str, place: BuiltPlace, out: Path | None, fill: Literal["planes", "lifter"], exact: bool) -> list[float]:
+    """Figures of one room; returns which share of each step's Gaussians intrudes."""
     pose = place.starts[0].clone()
     pose[2] += EYE_M
     seen = rasterise(place.gaussians, pose[None], (0.5, 0.5, 0.5, 0.5), (384, 384))
@@ -110,15 +125,17 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: str, exact: bool)
     layers = layers_of(to_bytes(seen.rgb[0]).numpy(), load_lifter())
     if exact:
         known = {"depth": truth, "behind": truth[::2, ::2], "hides": 0 * layers.hides}
-        layers = replace(layers, **known, focal=0.5, pitch=0.0, roll=0.0, height_m=EYE_M)
+        layers = replace(layers, **known, error=0 * layers.error, focal=0.5, pitch=0.0, roll=0.0, height_m=EYE_M)
     ratio = float((truth / layers.depth).median())
     world = place_of(layers, name, {})
-    began, parts, intrusions, seams = time.monotonic(), [world.gaussians], [], []
+    began, parts, intrusions, seams, outside = time.monotonic(), [world.gaussians], [], [], []
+    low, high = place.solids[:, :3].amin(0) + WALL_M, place.solids[:, 3:].amax(0) - WALL_M
     turn = rotation(pose) @ rotation(world.starts[0]).T
     eyes, steps = viewpoints(world, 0), []
     for step, (more, _) in growth(world, GrowSpaceConfig(fill=fill), eyes):
         points = ratio * (more.means - world.starts[0, :3]) @ turn.T + pose[:3]
         intrusions.append(float((depth_to_solids(points, place.solids) > FREE_M).float().mean()))
+        outside.append(torch.maximum(low - points, points - high).clamp_min(0).norm(dim=1))
         seams.append(step.seam)
         parts.append(more)
         steps.append(step)
@@ -133,7 +150,8 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: str, exact: bool)
         f"{name}, {fill}, {kind} depth: {len(steps)} steps in {time.monotonic() - began:.0f} s; own coverage "
         f"{100 * last.coverage:.1f}%, surface {100 * sum(surface) / len(surface):.1f}% (least {100 * min(surface):.1f}%); "
         f"intruding steps {100 * bad:.0f}% (Gaussians {', '.join(f'{100 * one:.0f}' for one in intrusions)}%); seam "
-        f"{100 * sum(seams) / len(seams):.1f}%; revisit {last.closure_db:.1f} dB after "
+        f"{100 * sum(seams) / len(seams):.1f}%; beyond {float(torch.cat(outside).median()):.2f} m; "
+        f"revisit {last.closure_db:.1f} dB after "
         f"{max(one.away_deg for one in steps):.0f} degrees",
         flush=True,
     )
@@ -142,23 +160,37 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: str, exact: bool)
         rows = [rasterise(one, around, None, (256, 512)).rgb[0] for one in (world.gaussians, whole)]
         file = f"grow-{name}-{fill}-{kind}.png".replace(" ", "-")
         Image.fromarray(to_bytes(torch.cat(rows, 1)).numpy()).save(out / file)
+    return intrusions
+
+
+def rooms(out: Path | None) -> None:
+    """Figures of many rooms."""
+    steps = []
+    for seed in SEEDS:
+        for text in TEXTS:
+            steps += grow(f"{text} {seed}", built(text, seed=seed), out, "planes", False)
+    bad = sum(one > INTRUDING for one in steps)
+    print(f"{bad} of {len(steps)} steps intrude ({100 * bad / len(steps):.0f}%)")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("panorama", "grow"))
+    parser.add_argument("what", choices=("panorama", "grow", "rooms"))
     parser.add_argument("--out", type=Path, help="folder for pictures")
     parser.add_argument("--room", choices=tuple(ROOMS), help="one room alone")
     given = parser.parse_args()
     if given.out:
         given.out.mkdir(parents=True, exist_ok=True)
+    if given.what == "rooms":
+        return rooms(given.out)
     for name in [given.room] if given.room else MEASURED[given.what]:
         if given.what == "panorama":
             panorama(name, ROOMS[name], given.out)
         else:
             place = built(ROOMS[name])
-            for fill, exact in (("planes", False), ("lifter", False), ("planes", True)):
-                grow(name, place, given.out, fill, exact)
+            grow(name, place, given.out, "planes", False)
+            grow(name, place, given.out, "lifter", False)
+            grow(name, place, given.out, "planes", True)
 
 
 if __name__ == "__main__":

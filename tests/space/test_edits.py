@@ -13,8 +13,9 @@ from terrella.library import load
 from terrella.space.edits import apply_edits, select
 from terrella.space.raster import Gaussians
 from terrella.space.raster.gaussians import plain_sh
+from terrella.workflows.splat_places import unedited_scene
 from terrella.worlds.splat import SplatConfig, SplatWorld
-from terrella.worlds.splat_folder import save_splat, world_of
+from terrella.worlds.splat_folder import load_source, save_splat, world_of, write_edits
 
 from .test_fitting import LENS, SIZE, room
 from .test_raster import cloud, parts
@@ -131,6 +132,25 @@ def test_edits_that_ruin_a_place_together_are_refused(monkeypatch):
     twice = {"select": {"all": True}, "do": "duplicate", "by": [0, 0, 0]}
     with pytest.raises(ContractError, match="at most"):
         apply_edits(cloud(60), [twice] * 30)
+
+
+def test_a_wrong_edit_is_named_and_its_place_is_not_called_damaged(tmp_path):
+    good, wrong = ({"select": BOX, "do": "move", "by": [x, 0, 0]} for x in (1.0, float("nan")))
+    save_splat(world_of(room(count=800), "room", {}, SplatConfig(LENS, SIZE)), tmp_path / "w")
+    with pytest.raises(ContractError, match="^edit 2 of 2: 'by' takes 3 finite numbers"):
+        load_source(tmp_path / "w", [good, wrong])
+    after = unedited_scene(str(tmp_path / "w")).collider_after  # what the page asks for
+    assert after is not None
+    with pytest.raises(ContractError, match="^'by' takes"):
+        after([wrong])
+    write_edits(tmp_path / "w", [good, wrong])
+    with pytest.raises(
+        CheckpointError, match="world.edits.jsonl holds an edit that does not fit the place .edit 2 of 2"
+    ):
+        load(str(tmp_path / "w"))
+    write_edits(tmp_path / "w", [{"do": "merge", "place": "../w"}])
+    with pytest.raises(CheckpointError, match="world.edits.jsonl holds an edit .* names a `place` and its `sha256`"):
+        load(str(tmp_path / "w"))
 
 
 def test_edits_are_lines_that_can_be_undone(tmp_path, capsys):

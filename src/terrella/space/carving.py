@@ -15,14 +15,10 @@ from .raster import Gaussians, rasterise
 from .walkable import spread_out, walkable
 
 ROWS = 192  # of a panorama
-EYES = (
-    12,
-    6,
-    6,
-)  # points at most that are looked from, in rounds: the later look from where one can walk to after those before
+EYES = (40, 12, 12)  # points at most that are looked from, in rounds; later ones are those walked to after those before
 PLACES = 3000  # at most, that are walked to
 OPAQUE = 0.5  # alpha of pixels that show a surface
-NEAR = 0.03  # cells that lie less than this share of the distance, and a cell, before a surface are kept
+KEPT = 0.5  # cells whose middle lies less than this many cells before a surface are kept: they reach into it
 FAR_M, SMOOTH = (
     8.0,
     0.1,
@@ -73,5 +69,5 @@ def _look(
     row = ((0.5 - (off[:, 2] / far).asin() / math.pi) * ROWS).long().clamp(0, ROWS - 1)
     column = ((1 - torch.atan2(off[:, 1], off[:, 0]) / math.pi) * ROWS).long() % (2 * ROWS)
     before = torch.zeros_like(filled)
-    before[tuple(some[far < (1 - NEAR) * nearest[row, column] - place.cell_m].T)] = True
+    before[tuple(some[far < nearest[row, column] - KEPT * place.cell_m].T)] = True
     return before

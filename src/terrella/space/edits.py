@@ -67,38 +67,47 @@ def apply_edits(
     objects: torch.Tensor | None = None,
     other: Callable[[Edit], Contents] | None = None,
 ) -> Edited:
-    """Applies edits in order. objects int32 [N]; `other` opens the place of a merge. ContractError for a wrong edit."""
-    origin, known, raised = torch.arange(len(gaussians)), len(gaussians), []
+    """Applies edits in order. objects int32 [N]; `other` opens the place of a merge. ContractError for a wrong edit, with its
+    number where there are several."""
     objects = torch.zeros(len(gaussians), dtype=torch.int32) if objects is None else objects
-    for edit in edits:
-        closed: list[Gaussians] = []
-        if edit.get("do") == "merge":
-            if other is None:
-                raise ContractError("a merge needs the other place; give `other`, which opens it.")
-            came, chosen = other(edit), torch.zeros(len(gaussians), dtype=torch.bool)
-            done, fresh = _placed(came.gaussians, edit), known + torch.arange(len(came.gaussians))
-            raised.append(int(objects.max()) if len(objects) else 0)
-            belong = (came.objects + raised[-1] * came.objects.sign()).int()
-            known += len(done)
-        else:
-            chosen = select(gaussians, edit, objects)
-            if edit.get("do") in MOVING:
-                gaussians, objects = _revealed(gaussians, objects, objects[chosen])
-                closed = _closed(gaussians, objects, chosen, edit)
-            done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
-            fresh = torch.full((len(done),), -1)
-        if edit["do"] == "duplicate":
-            belong = torch.full_like(belong, int(objects.max()) + 1)
-            chosen = torch.zeros_like(chosen)  # what was duplicated stays, too
-        if not (done.means.isfinite().all() and done.scales.isfinite().all()):
-            raise ContractError(f"'{edit['do']}' leads out of all numbers; take smaller ones.")
-        if len(gaussians) + len(done) > MOST_GAUSSIANS:
-            raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; add less.")
-        gaussians = join([gaussians.at(~chosen), done, *closed])
-        new = sum(len(part) for part in closed)
-        origin = torch.cat([origin[~chosen], fresh, torch.full((new,), -1)])
-        objects = torch.cat([objects[~chosen], belong[: len(done)], torch.zeros(new, dtype=torch.int32)])
-    return Edited(gaussians, origin, objects, tuple(raised))
+    now, known = Edited(gaussians, torch.arange(len(gaussians)), objects), len(gaussians)
+    for number, edit in enumerate(edits, 1):
+        try:
+            now, known = _edited(now, known, edit, other)
+        except ContractError as error:
+            raise ContractError(f"edit {number} of {len(edits)}: {error}" if len(edits) > 1 else str(error)) from error
+    return now
+
+
+def _edited(now: Edited, known: int, edit: Edit, other: Callable[[Edit], Contents] | None) -> tuple[Edited, int]:
+    """What an edit makes of a place. known: how many Gaussians the first place and all that was merged into it had."""
+    gaussians, objects, raised, closed = now.gaussians, now.objects, now.raised, []
+    if edit.get("do") == "merge":
+        if other is None:
+            raise ContractError("a merge needs the other place; give `other`, which opens it.")
+        came, chosen = other(edit), torch.zeros(len(gaussians), dtype=torch.bool)
+        done, fresh = _placed(came.gaussians, edit), known + torch.arange(len(came.gaussians))
+        raised = (*raised, int(objects.max()) if len(objects) else 0)
+        belong = (came.objects + raised[-1] * came.objects.sign()).int()
+        known += len(done)
+    else:
+        chosen = select(gaussians, edit, objects)
+        if edit.get("do") in MOVING:
+            gaussians, objects = _revealed(gaussians, objects, objects[chosen])
+            closed = _closed(gaussians, objects, chosen, edit)
+        done, belong = _done(gaussians.at(chosen), edit), objects[chosen]
+        fresh = torch.full((len(done),), -1)
+    if edit["do"] == "duplicate":
+        belong = torch.full_like(belong, int(objects.max()) + 1)
+        chosen = torch.zeros_like(chosen)  # what was duplicated stays, too
+    if not (done.means.isfinite().all() and done.scales.isfinite().all()):
+        raise ContractError(f"'{edit['do']}' leads out of all numbers; take smaller ones.")
+    if len(gaussians) + len(done) > MOST_GAUSSIANS:
+        raise ContractError(f"a place has at most {MOST_GAUSSIANS:,} Gaussians; add less.")
+    new = sum(len(part) for part in closed)
+    origin = torch.cat([now.origin[~chosen], fresh, torch.full((new,), -1)])
+    objects = torch.cat([objects[~chosen], belong[: len(done)], torch.zeros(new, dtype=torch.int32)])
+    return Edited(join([gaussians.at(~chosen), done, *closed]), origin, objects, raised), known
 
 
 def _closed(gaussians: Gaussians, objects: torch.Tensor, chosen: torch.Tensor, edit: Edit) -> list[Gaussians]:

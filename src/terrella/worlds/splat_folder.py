@@ -73,8 +73,8 @@ def check_free(path: str | Path) -> None:
 
 
 def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | None = None) -> SplatWorld:
-    """Reads what `save_splat` wrote. about: its world.json; edits: in place of its own. CheckpointError where it is foreign or
-    damaged."""
+    """Reads what `save_splat` wrote. about: its world.json; edits: in place of its own. CheckpointError where it or its own edits
+    are foreign or damaged, ContractError where `edits` do not fit it."""
     path = Path(path)
     if about.get("version") != VERSION:
         raise CheckpointError(
@@ -104,12 +104,18 @@ def load_splat(path: str | Path, about: dict[str, Any], edits: Sequence[Edit] | 
             str(about["name"]), Gaussians(**tensors), provenance, starts, config, dict(about["card"]), objects,
             SolidBoxes.of(solids, bodies),
         )  # fmt: skip
-        edits = read_edits(path) if edits is None else edits
-        world = _after(world, edits, merged_loader(path)) if edits else world
-        world.collider_file = path / (EDITED_FILE if edits else COLLIDER_FILE)
-        return world
     except (OSError, SafetensorError, LookupError, TypeError, ValueError, RuntimeError, ContractError) as error:
         raise CheckpointError(f"{path} is damaged or incomplete ({error}); make it again.") from error
+    lines = read_edits(path) if edits is None else edits
+    try:
+        world = _after(world, lines, merged_loader(path)) if lines else world
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ContractError) as error:
+        if edits is not None and isinstance(error, ContractError):
+            raise
+        kept = f"{path / EDITS_FILE} holds an edit that does not fit the place ({error}); mend or remove it."
+        raise CheckpointError(kept) from error
+    world.collider_file = path / (EDITED_FILE if lines else COLLIDER_FILE)
+    return world
 
 
 def _after(source: SplatWorld, edits: Sequence[Edit], other: Callable[[Edit], SplatWorld]) -> SplatWorld:
