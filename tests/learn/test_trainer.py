@@ -352,6 +352,15 @@ def test_a_feed_that_cannot_shrink_says_what_to_do_where_memory_is_out(tmp_path)
         Trainer(Run.of(tmp_path, Settings(), quiet), "toy", Fed(4, 2), Toy(), STEPS).train()
 
 
+def test_a_load_ends_what_was_captured(tmp_path):
+    """A CUDA graph would go on with what the optimiser kept before."""
+    trainer = trainer_in(tmp_path)
+    trainer.train()
+    assert set(trainer._updates) == {"body", "head"}
+    trainer._load()
+    assert not trainer._updates
+
+
 def test_worlds_are_seeded_by_a_generator_of_the_cpu():
     """One of a GPU would draw the seeds of a batch one by one."""
     given, drawn = torch.device("cpu"), make_rng(5)

@@ -25,15 +25,17 @@ class Update:
         self._result = torch.empty(0)
 
     def __call__(self, finite: torch.Tensor) -> torch.Tensor:
+        if not self._capturable or finite.device.type != "cuda":
+            return self.run(finite)
         weights = [
             weight for module in self.learner.modules for weight in module.parameters() if weight.grad is not None
         ]
-        if not self._capturable or finite.device.type != "cuda":
-            return self.run(finite)
         same = len(weights) == len(self._stepped) and all(one is other for one, other in zip(weights, self._stepped))
         if not same:  # the optimiser makes what it keeps, and libraries choose their algorithms
-            self._stepped, self._graph = weights, None
-            return self.run(finite)
+            self._stepped, self._graph = [], None
+            finite = self.run(finite)
+            self._stepped = weights
+            return finite
         gradients = [weight.grad for weight in weights if weight.grad is not None]
         try:
             if self._graph is None:
@@ -58,11 +60,13 @@ class Update:
         learner = self.learner
         for module in learner.modules:
             finite = finite & torch.isfinite(nn.utils.clip_grad_norm_(module.parameters(), learner.clip))
-        if finite.device.type == "cpu" and not finite:
-            return finite
-        for weight in (weight for module in learner.modules for weight in module.parameters()):
-            if weight.grad is not None:
-                weight.grad.masked_fill_(~finite, 0)
+        if finite.device.type == "cpu":
+            if not finite:
+                return finite
+        else:
+            for weight in (weight for module in learner.modules for weight in module.parameters()):
+                if weight.grad is not None:
+                    weight.grad.masked_fill_(~finite, 0)
         learner.optimiser.step()
         if learner.average is not None:
             learner.average.update(learner.modules[0])
@@ -71,7 +75,7 @@ class Update:
     def _capture(self, finite: torch.Tensor, weights: list[nn.Parameter], gradients: list[torch.Tensor]) -> None:
         groups = self.learner.optimiser.param_groups
         rates = [group["lr"] for group in groups]
-        places = [finite.clone(), *(torch.tensor(rate, device=finite.device) for rate in rates)]
+        places = [finite.clone(), *(finite.new_tensor(rate, dtype=torch.float32) for rate in rates)]
         places += [gradient.clone() for gradient in gradients]
         try:
             for group, place in zip(groups, places[1:]):
@@ -79,7 +83,8 @@ class Update:
             for weight, place in zip(weights, places[1 + len(rates) :]):
                 weight.grad = place
             graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
+            # a capture that fails leaves its own stream in force
+            with torch.cuda.stream(torch.cuda.current_stream()), torch.cuda.graph(graph):
                 self._result = self.run(places[0])
         finally:
             for group, rate in zip(groups, rates):

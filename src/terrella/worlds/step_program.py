@@ -141,7 +141,8 @@ def captured(run: Run, inputs: list[torch.Tensor]) -> Run:
             run(fixed)
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    # a capture that fails leaves its own stream in force
+    with torch.cuda.stream(torch.cuda.current_stream()), torch.cuda.graph(graph):
         made = run(fixed)
 
     def replay(given: list[torch.Tensor]) -> list[torch.Tensor]:
