@@ -17,7 +17,6 @@ from terrella.data import Recorder
 from terrella.learn.moves import Scrolling, stitch_episodes
 from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
 from terrella.learn.recipes.video import train_video
-from terrella.learn.recipes.video_flat import stress_of
 from terrella.learn.recording import Recording
 from terrella.learn.train_step import TrainStep
 from terrella.worlds.controls import Controls
@@ -112,26 +111,6 @@ def learned(share: float) -> list[float]:
             losses.append(float(loss.parts["draft"].detach()))
             assert set(loss.parts) == ({"draft"} if share < DRAFTS else {"draft", "drawn"})
     return losses
-
-
-def test_a_still_picture_costs_nothing_before_training_whatever_the_noise_on_its_history():
-    network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
-    still = torch.randint(0, 256, (8, 1, 3, 16, 16), dtype=torch.uint8, generator=make_rng(0)).expand(-1, 3, -1, -1, -1)
-    (loss,) = FlowFrames(network, 5e-3, 1, 4.0).losses(FlowClips(still, torch.zeros(8, 3, 1), None), step())
-    assert float(loss.value.detach()) == 0
-
-
-def test_small_things_that_move_weigh_as_much_as_large_ones(tmp_path):
-    """A dot of one pixel changes two of 768, so that these weigh more than a hundred times as much as the others."""
-    with Recorder(tmp_path / "set", layout_of(10.0, ("right",), rgb=SIZE)) as recorder:
-        for row in range(30):
-            picture = np.zeros((*SIZE, 3), np.uint8)
-            picture[10, row] = 255
-            recorder.add({"rgb": picture}, np.array([True]) if row < 29 else None, 0.0, False)
-        recorder.end_episode()
-    recording = Recording.open(tmp_path / "set", SIZE, quiet)
-    network = FlowNetwork(FlowConfig(SIZE, 2, 36 + 2, channels=(8, 8, 8)))
-    assert stress_of(recording, network, 0) > 16
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9])

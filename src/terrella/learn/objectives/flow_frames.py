@@ -138,8 +138,9 @@ class FlowFrames:
             base, was = (carry(one, scroll, network.moves, network.over, memory) for one in (base, was))
         changes = (clean - was).abs().amax(1, keepdim=True) > CHANGED / 127.5
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
+        frames = frames + level * now.randn(*frames.shape)
         with now.half():
-            seen = self._encode(frames, context, scroll, memory, level * now.randn(*frames.shape))
+            seen = self._encode(frames, context, scroll, memory)
             draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device))
         parts = {"draft": self._error(draft, clean, base, changes)}
         if now.share < DRAFTS:
