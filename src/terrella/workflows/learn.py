@@ -277,7 +277,7 @@ class _Learning:
             schedule.note("clips", most_clips_within(exam, schedule.left_s(SCORING), CLIP_COUNTS))
         if not schedule.facts["clips"]:
             later = command("terrella", "score", run, data=data, quick=True)
-            return {"verdict": [f"{schedule.folder.name} is not scored: no time was left. Score it: {later}"]}
+            return {"verdict": [f"{schedule.folder.name} is not scored: too little time was left. Score it: {later}"]}
         exam = exam.of(schedule.facts["clips"])
         card, files = write_card(run, exam, identity, schedule.folder / "score", report)
         return {"verdict": verdict(card), "card": str(files[1])}
