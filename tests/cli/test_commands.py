@@ -48,6 +48,7 @@ OPTIONS = {
     "skills try": "--adapter --episodes --fps --in --json --randomise --seed --size --task",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",
     "bench costs": "--batch --device --fast --json --minutes --seed",
+    "bench geometry": "--data --device --fresh --json --rollouts --seed --steps",
     "bench physics": "--device --families --frames --json --out --rollouts --seed --steps --train",
     "adapt": "--batch --device --from --json --keep --learning-rate --minutes --no-laws --out --seed --steps",
     "check": "--coarse --data --device --fresh --json --metres-per-pixel --out --pictures --rollouts --seed --steps --system",

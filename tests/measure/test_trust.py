@@ -70,6 +70,10 @@ def test_the_forecast_is_where_the_expected_error_reaches_the_level():
     assert short is not None and (short.steps, short.ends) == (5, False)
     other = forecast_trust(Fading(), 50, Fading().start(3, make_rng(0)))
     assert other is not None and other.steps == 20
+    measured = forecast_trust(Fading(card={**CARD, "trust_steps_measured": 12}), 50)
+    assert measured is not None and (measured.steps, measured.measured) == (12, True), "no more than was measured"
+    longer = forecast_trust(Fading(card={**CARD, "trust_steps_measured": 30}), 50)
+    assert longer is not None and (longer.steps, longer.measured) == (20, False)
     assert forecast_trust(Fading(card={}), 50) is None, "it cannot say how far off chance is"
     assert forecast_trust(Fading(expects=0.0), 50) is None, "as a latent world of one member"
 

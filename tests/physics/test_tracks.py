@@ -14,7 +14,7 @@ from terrella.physics.constants import CONSTANTS
 from terrella.physics.laws.permanence import Permanence
 from terrella.physics.tracker import fit_tracker
 from terrella.physics.tracks import fit_tracked
-from terrella.sim.bodies import BodiesWorld
+from terrella.sim.bodies import BodiesConfig, BodiesWorld
 from terrella.workflows.check import CheckConfig, check
 
 DT_S = 0.025
@@ -110,6 +110,25 @@ def test_things_of_one_colour_that_touch_stay_two():
     assert float((tracks.place[:, 0] - torch.tensor(path)).norm(dim=-1).max()) < 1.0
 
 
+def test_masks_show_a_thing_that_mostly_lies_still_on_a_background_of_many_colours():
+    colour = (40.0, 200.0, 60.0)
+    path = [[(30.0, 20.0)]] * 24 + [[(30.0 - step, 20.0 + step)] for step in range(12)]
+    pictures = discs(path, (colour,))
+    masks = (pictures[..., 1] > 110).long()
+    tiles = 60 * (torch.arange(48)[:, None, None] // 6 % 2) * torch.tensor([1.0, 0.2, 1.0])
+    pictures = torch.where(masks[..., None] > 0, pictures, tiles.to(torch.uint8).expand_as(pictures))
+    places = torch.tensor(path, dtype=torch.double)
+    tracks = fit_tracked(pictures, DT_S, metres_per_pixel=0.1, masks=masks).tracker.follow(pictures)
+    assert bool(tracks.present.all()) and int(tracks.others.max()) == 0
+    assert float((tracks.place[:, 0] - places).norm(dim=-1).max()) < 0.3
+    blind = fit_tracked(
+        pictures, DT_S, metres_per_pixel=0.1
+    ).tracker.background  # without masks it is a part of the background
+    assert (blind[20, 30] - torch.tensor(colour)).norm() < 32
+    with pytest.raises(TerrellaError, match="nothing moves in the recorded masks"):
+        fit_tracked(pictures, DT_S, metres_per_pixel=0.1, masks=torch.zeros_like(masks))
+
+
 def test_the_scale_comes_from_things_that_fall():
     _, _, pictures, _, _ = film("parabola", 1, 16, 16)
     assert fit_tracked(pictures, DT_S).scale.metres_per_pixel == pytest.approx(6 / 64, rel=0.02)
@@ -130,16 +149,22 @@ def test_bad_pictures_get_a_sentence():
 
 
 def test_check_judges_pictures(tmp_path):
-    world = BodiesWorld("bouncing")
+    world = BodiesWorld("bouncing", BodiesConfig(segmentation=True))
     record(world, Idle(world.spec), tmp_path / "rec", 520, make_rng(0))
     config = CheckConfig(tmp_path / "rec", pictures=True, out=tmp_path, steps=16, rollouts=8, fresh=True)
     result = check("physics:bouncing", config)
     assert result.report.coarse_horizon.value == 16
-    assert "Judged by pictures: ball 1 tracked, 0.0375 m a pixel (fitted to recorded positions)" in result.summary()
+    assert (
+        "Judged by pictures: ball 1 tracked, found by the recorded masks, 0.0375 m a pixel (fitted to recorded positions)"
+        in result.summary()
+    )
     assert "The truth above, the world below" in (tmp_path / "check.html").read_text()
     with pytest.raises(TerrellaError, match="--metres-per-pixel is above 0"):
         check("physics:bouncing", CheckConfig(tmp_path / "rec", metres_per_pixel=0.0))
     with pytest.raises(TerrellaError, match="judged by its numbers"):
         check("physics:bouncing", CheckConfig(tmp_path / "rec", metres_per_pixel=0.01))
     config = dataclasses.replace(config, metres_per_pixel=0.05)
-    assert "thing 1 tracked, 0.05 m a pixel (as given)" in check("physics:bouncing", config).summary()
+    assert (
+        "thing 1 tracked, found by the recorded masks, 0.05 m a pixel (as given)"
+        in check("physics:bouncing", config).summary()
+    )

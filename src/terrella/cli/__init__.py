@@ -30,6 +30,7 @@ COMMANDS = {
         "how much faster than real time a world imagines, beside MuJoCo",
     ),
     "bench costs": ("studies:costs", "what a world costs: milliseconds, joules and memory, of a frame and of play"),
+    "bench geometry": ("physics:bench_geometry", "dimensions, Lyapunov exponents and trust horizon of a latent world"),
     "bench physics": ("physics:bench_physics", "how well worlds predict moving bodies, with and without a guard"),
     "record doom": ("record:record_doom", "record the game Doom, by a script or by a person"),
     "record world": ("record:record_world", "record any other world or Gymnasium environment"),

@@ -1,4 +1,4 @@
-"""The commands `check` and `bench physics`."""
+"""The commands `check`, `bench physics` and `bench geometry`."""
 
 from typing import Annotated
 
@@ -8,6 +8,7 @@ from ..workflows.bench_physics import BenchPhysicsConfig
 from ..workflows.bench_physics import bench_physics as run_bench
 from ..workflows.check import CheckConfig
 from ..workflows.check import check as run_check
+from ..workflows.geometry import GeometryConfig, measure_geometry
 from ..workflows.results import command
 from .say import Json, WorldName, say, show
 
@@ -38,3 +39,15 @@ def bench_physics(
         world: A latent world of such a family. Default: the baselines alone, or worlds that --train makes.
     """
     show(run_bench(world, config, progress=say), json, command("terrella", "play", "physics:bouncing"))
+
+
+def bench_geometry(world: WorldName, config: GeometryConfig, json: Json = False) -> None:
+    """Measure the geometry of a latent world: how many dimensions its data fill, how far predictions leave them, and how fast
+    nearby rollouts part.
+
+    The last gives a trust horizon before any rollout is compared with the truth; the measured one stands beside it.
+
+    Args:
+        world: A latent world: a run of `train latent`, or its folder.
+    """
+    show(measure_geometry(world, config, progress=say), json, command("terrella", "score", world, data=config.data))

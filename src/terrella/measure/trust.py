@@ -35,6 +35,9 @@ class TrustForecast:
     limit: int  # steps of the rollouts
     level: float  # expected error at which trust ends, in the unit of `uncertainty`
     expected: tuple[float, ...]  # mean expected error of each step
+    measured: bool = (
+        False  # whether `steps` is the measured horizon of the world's card, which is shorter than the forecast
+    )
 
     @property
     def ends(self) -> bool:
@@ -59,8 +62,8 @@ def forecast_trust(
     world: World, limit: int, state: State | None = None, policy: Policy | None = None, seed: int = 0
 ) -> TrustForecast | None:
     """How many steps from `state` (default: 8 starts of the world) can be trusted, of at most `limit`, under a policy (default:
-    held random actions) that is shown nothing. None for a world that expects no error, or the same
-    at every step."""
+    held random actions) that is shown nothing; never more than the measured horizon of the world's card (`trust_steps_measured`),
+    where it has one. None for a world that expects no error, or the same at every step."""
     chance, rng = chance_error(world.spec), make_rng(seed)
     if not math.isfinite(chance) or limit < 1:
         return None
@@ -74,7 +77,9 @@ def forecast_trust(
     if limit > 1 and max(expected) == min(expected):
         return None
     level = trust_level(expected[0], chance)
-    return TrustForecast(steps_within(torch.tensor(expected), level), limit, level, tuple(expected))
+    steps, most = steps_within(torch.tensor(expected), level), world.spec.card.get("trust_steps_measured")
+    shorter = isinstance(most, int) and most < steps
+    return TrustForecast(most if shorter else steps, limit, level, tuple(expected), shorter)
 
 
 # -- the probe: forecast beside measured ----------------------------------------------------------------------------

@@ -182,8 +182,7 @@ def fit_tracker(pictures: Tensor) -> Tracker:
     colours: list[Tensor] = []
     left = seen
     while len(left) > SHARE * len(seen) and len(colours) < COLOURS:
-        bins = (left / 32).long() @ torch.tensor([64, 8, 1])
-        middle = left[bins == bins.mode().values].median(0).values
+        middle = common_colour(left)
         near = (left - middle).norm(dim=1) < NEAR
         if int(near.sum()) > SHARE * len(seen):
             colours.append(left[near].median(0).values)
@@ -194,11 +193,16 @@ def fit_tracker(pictures: Tensor) -> Tracker:
     return Tracker(background, tracker.colours, float(sizes.quantile(0.1)) if len(sizes) else 1.0)
 
 
+def common_colour(colours: Tensor) -> Tensor:
+    """The commonest of colours [P, 3], 0 to 255, to within 32: [3]."""
+    bins = (colours / 32).long() @ torch.tensor([64, 8, 1])
+    return colours[bins == bins.mode().values].median(0).values
+
+
 def _floored(some: Tensor, background: Tensor) -> Tensor:
     """The background, with its commonest colour wherever that is seen now and then: what mostly lies there is a thing."""
     flat = background.flatten(0, 1)
-    bins = (flat / 32).long() @ torch.tensor([64, 8, 1])
-    floor = flat[bins == bins.mode().values].median(0).values
+    floor = common_colour(flat)
     seen = ((some - floor).abs().amax(-1) < DIFFERENCE / 2).float().mean(0) > SHARE
     return torch.where(seen[..., None], floor, background)
 

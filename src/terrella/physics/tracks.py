@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..core.errors import TerrellaError
+from .masks import tracker_of_masks
 from .system import EARTH, PhysicalSystem, RigidBody, Slot
 from .tracker import Tracker, Tracks, fit_tracker
 from .trajectory import Trajectory, trajectory_of
@@ -92,8 +93,10 @@ def fit_tracked(
     system: PhysicalSystem | None = None,
     positions: Tensor | None = None,
     metres_per_pixel: float | None = None,
+    masks: Tensor | None = None,
 ) -> Tracked:
-    """What tracks a recording's things, from uint8 pictures [T + 1, B, H, W, 3] of it.
+    """What tracks a recording's things, from uint8 pictures [T + 1, B, H, W, 3] of it, and from masks int [T + 1, B, h, w] that number
+    what is seen at each pixel, where they are recorded.
 
     The scale is `metres_per_pixel`, else of `positions` [T + 1, B, N, 2] of the system's bodies in their plane, else of gravity,
     where things fall freely. The bodies are the system's where it is from positions, else things of which nothing is known.
@@ -104,7 +107,8 @@ def fit_tracked(
         raise TerrellaError(
             "the bodies move in three dimensions, and pictures are judged where they move in a plane; record their positions."
         )
-    tracker = fit_tracker(pictures.flatten(0, 1))
+    flat = pictures.flatten(0, 1)
+    tracker = fit_tracker(flat) if masks is None else tracker_of_masks(flat, masks.flatten(0, 1))
     tracks = tracker.follow(pictures)
     height = pictures.shape[2]
     if metres_per_pixel is not None:

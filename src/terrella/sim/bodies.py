@@ -146,13 +146,15 @@ class BodiesConfig:
     split: Literal["in", "out"] = "in"
     # Show a picture, 64 x 64.
     pictures: bool = True
+    # Show which ball is seen at each pixel, as segmentation.
+    segmentation: bool = False
 
 
 class BodiesWorld:
     """`BodiesWorld("bouncing")`: a family of FAMILIES. It has one action, to wait.
 
     Channels: position [2 N] (x, z of each ball, m), velocity [2 N] (m/s), radius [N] (m), spin [N] (rad/s, where the family has
-    one), rgb, done. A state follows from its channels: `observe` sets it. TerrellaError for an unknown family."""
+    one), rgb, segmentation (the number of the ball at each pixel, -1 for none), done. A state follows from its channels: `observe` sets it. TerrellaError for an unknown family."""
 
     def __init__(self, family: str, config: BodiesConfig = BodiesConfig()):
         if family not in FAMILIES:
@@ -166,6 +168,7 @@ class BodiesWorld:
         widths = {"position": 2 * count, "velocity": 2 * count, "radius": count, "spin": count}
         channels: dict[str, spaces.Space] = {name: _numbers(widths[name]) for name in self._held}
         channels |= {"rgb": spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)} if config.pictures else {}
+        channels |= {"segmentation": spaces.Box(-1, count - 1, (SIDE, SIDE), np.int32)} if config.segmentation else {}
         units = {"position": "m", "velocity": "m/s", "radius": "m", "spin": "rad/s"}
         self.spec = Spec(
             name=f"physics:{family}" + (":out" if config.split == "out" else ""),
@@ -216,23 +219,41 @@ class BodiesWorld:
     def _shown(self, state: State, name: str) -> Tensor:
         if name == "done":
             return state["done"]
+        if name == "segmentation":
+            return self._segmentation(state)
         return self._picture(state) if name == "rgb" else state[name].flatten(1).float()
+
+    def _pixels(self) -> tuple[float, Tensor, Tensor]:
+        """(size of a pixel, x of the columns [SIDE], z of the rows [SIDE]), m."""
+        left, bottom, width = self.family.view
+        pixel = width / SIDE
+        middle = pixel * (torch.arange(SIDE) + 0.5).double()
+        return pixel, left + middle, bottom + width - middle
+
+    def _cover(self, state: State, at: int) -> Tensor:
+        """How much of each pixel a ball covers [B, SIDE, SIDE], 0 to 1."""
+        pixel, x, z = self._pixels()
+        centre, radius = state["position"][:, at], state["radius"][:, at, None, None]
+        away = ((x - centre[:, :1])[:, None, :] ** 2 + (z - centre[:, 1:])[:, :, None] ** 2).sqrt()
+        return ((radius - away) / pixel + 0.5).clamp(0, 1)
+
+    def _segmentation(self, state: State) -> Tensor:
+        """int32 [B, SIDE, SIDE]: the number of the ball that is seen, -1 for none."""
+        seen = torch.full((state.batch, SIDE, SIDE), -1, dtype=torch.int32)
+        for at in range(self.family.bodies):
+            seen[self._cover(state, at) > 0.5] = at
+        return seen
 
     def _picture(self, state: State) -> Tensor:
         """uint8 [B, SIDE, SIDE, 3], seen from the side."""
-        left, bottom, width = self.family.view
-        pixel = width / SIDE
-        x = left + pixel * (torch.arange(SIDE) + 0.5).double()
-        z = bottom + pixel * (SIDE - torch.arange(SIDE) - 0.5).double()
+        _, x, z = self._pixels()
         picture = torch.tensor(_SKY).double().expand(state.batch, SIDE, SIDE, 3).clone()
         for wall in self.family.walls:
             normal, centre = wall.normal or _NONE, wall.centre_m
             behind = (x[None, :] - centre[0]) * normal[0] + (z[:, None] - centre[2]) * normal[2] < 0
             picture[:, behind] = torch.tensor(_FLOOR).double()
         for at in range(self.family.bodies):
-            centre, radius = state["position"][:, at], state["radius"][:, at, None, None]
-            away = ((x - centre[:, :1])[:, None, :] ** 2 + (z - centre[:, 1:])[:, :, None] ** 2).sqrt()
-            cover = ((radius - away) / pixel + 0.5).clamp(0, 1)[..., None]
+            cover = self._cover(state, at)[..., None]
             picture = picture * (1 - cover) + cover * torch.tensor(_COLOURS[at % len(_COLOURS)])
         return picture.round().to(torch.uint8)
 

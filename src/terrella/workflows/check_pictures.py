@@ -18,6 +18,7 @@ CONTEXT = 4  # rows that a world observes before it predicts
 EDGE = 3  # rows after those that are judged: velocities are measured from the pictures at both sides
 FITTED = 80  # rollouts at most to which tracker and scale are fitted
 RECORDED = "recorded"
+MASKS = ("segmentation", "instances")  # kinds of channels that number what is seen at each pixel
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,8 @@ def motions_in_pictures(
     pictures = [_rows(some, channel) for some in (known, clips)]
     places = [None if metres_per_pixel else _positions(system, some, dt_s) for some in (known, clips)]
     fitted = places[0][:, :FITTED] if places[0] is not None else None
-    tracked = fit_tracked(pictures[0][:, :FITTED], dt_s, system, fitted, metres_per_pixel)
+    masks = _masks(known[:FITTED], channel)
+    tracked = fit_tracked(pictures[0][:, :FITTED], dt_s, system, fitted, metres_per_pixel, masks)
     metric = StepMetric((channel,), lambda seen, *_: {channel: seen[channel]})
     predicted = dream(world, clips, RECORDED, steps, rng, [metric])[channel].transpose(0, 1)
     pictures.append(torch.cat([pictures[1][:CONTEXT], predicted.to(torch.uint8)]))
@@ -65,21 +67,29 @@ def motions_in_pictures(
             "in nearly all rollouts something reaches the picture's edge, where it cannot be measured; take fewer --steps."
         )
     others, truth, mine = (_judged(part, keep) for part, keep in ((others, good), (truth, whole), (mine, whole)))
-    return PictureMotions(others, truth, mine, _note(tracked, float(whole.double().mean())))
+    by = "" if masks is None else ", found by the recorded masks"
+    return PictureMotions(others, truth, mine, _note(tracked, float(whole.double().mean()), by))
 
 
 def _judged(motion: Trajectory, keep: Tensor) -> Trajectory:
     return motion.at(keep).between(CONTEXT - 1, motion.steps + 1 - EDGE)
 
 
-def _note(tracked: Tracked, kept: float) -> str:
+def _note(tracked: Tracked, kept: float, by: str) -> str:
     things = ", ".join(body.name for body in tracked.system.bodies[:-1])
-    words = (
-        f"Judged by pictures: {things} tracked, {tracked.scale.metres_per_pixel:.3g} m a pixel ({tracked.scale.source})"
-    )
+    words = f"Judged by pictures: {things} tracked{by}, {tracked.scale.metres_per_pixel:.3g} m a pixel ({tracked.scale.source})"
     return words + (
         f"; {1 - kept:.0%} of rollouts left out, as something reaches the picture's edge." if kept < 1 else "."
     )
+
+
+def _masks(clips: list[Clip], channel: str) -> Tensor | None:
+    """Masks of the camera of `channel`, int [T + 1, B, h, w]; None where none were recorded."""
+    camera = channel.removeprefix("rgb")
+    names = [kind + camera for kind in MASKS if all(kind + camera in clip.channels for clip in clips)]
+    if not names:
+        return None
+    return torch.from_numpy(np.stack([np.asarray(clip.channels[names[0]], np.int64) for clip in clips], 1))
 
 
 def _rows(clips: list[Clip], channel: str) -> Tensor:

@@ -33,8 +33,10 @@ def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
     forecast = forecast_trust(world, steps)
     if forecast is None or not forecast.ends:
         return steps
+    why = f"there it expects an error of {forecast.level:.2g}, half way to chance"
+    why = "there its error was measured to be half way to chance" if forecast.measured else why
     progress(
-        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: there it expects an error of "
-        f"{forecast.level:.2g}, half way to chance. Its {what} end there; --trust sets another limit."
+        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: {why}. Its {what} end there; --trust sets "
+        "another limit."
     )
     return forecast.steps

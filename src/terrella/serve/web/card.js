@@ -43,7 +43,7 @@ function plainly({ card, dt_s: dt, cameras, mapped }) {
     ['Built from', card.text ? `the words “${card.text}”` : card.kind === 'splat' ? card.file : null],
     ['In it', counted(card.kind === 'splat' && Array.isArray(card.objects) ? card.objects : [])],
     ['Usual error', card.uncertainty?.sure && card.kind !== 'splat' ? `${(100 * card.uncertainty.sure).toFixed(1)}% of full brightness, in a picture that it is sure of` : null],
-    ['Trusted for', card.trust_steps_forecast ? `${(card.trust_steps_forecast * dt).toFixed(1)} seconds (${card.trust_steps_forecast} steps), by its own forecast` : null],
+    ['Trusted for', card.trust_steps_forecast ? `${(card.trust_steps_forecast * dt).toFixed(1)} seconds (${card.trust_steps_forecast} steps), by its own forecast${card.trust_steps_measured ? `; measured: ${card.trust_steps_measured} steps ${card.trust_measured}` : ''}` : null],
     ['A picture costs', card.joules_per_frame_estimated ? `about ${card.joules_per_frame_estimated} joules, estimated` : null],
     ['Laws of physics', card.laws_passed],
     ['Physics', card.physics],
