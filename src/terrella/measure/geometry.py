@@ -59,7 +59,7 @@ def jacobians(step: Step, number: int, points: Tensor, columns: slice) -> Tensor
 
 
 def effective_rank(matrices: Tensor) -> Tensor:
-    """The participation ratio of the squared singular values of matrices [..., n, m]: n where all are equal, 1 where one is left."""
+    """The participation ratio of the squared singular values of matrices [..., n, m]: n where all are equal, else less."""
     square = torch.linalg.svdvals(matrices).square()
     return square.sum(-1).square() / square.square().sum(-1).clamp_min(1e-30)
 

@@ -78,8 +78,9 @@ def forecast_trust(
         return None
     level = trust_level(expected[0], chance)
     steps, most = steps_within(torch.tensor(expected), level), world.spec.card.get("trust_steps_measured")
-    shorter = isinstance(most, int) and most < steps
-    return TrustForecast(most if shorter else steps, limit, level, tuple(expected), shorter)
+    if isinstance(most, int) and most < steps:
+        return TrustForecast(most, limit, level, tuple(expected), True)
+    return TrustForecast(steps, limit, level, tuple(expected))
 
 
 # -- the probe: forecast beside measured ----------------------------------------------------------------------------

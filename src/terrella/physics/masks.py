@@ -1,4 +1,4 @@
-"""A tracker that learns from masks what moves: a thing that mostly lies still, or a background of many colours, does not mislead it."""
+"""A tracker that learns from masks what moves, whatever mostly lies still and however many colours the background has."""
 
 import torch
 import torch.nn.functional as F
@@ -12,8 +12,8 @@ SHOWN = 256  # pictures
 
 
 def tracker_of_masks(pictures: Tensor, masks: Tensor) -> Tracker:
-    """A tracker of what moves in uint8 pictures [F, H, W, 3] from one camera that stands still, by the masks int [F, h, w] that number
-    what is seen at each pixel. TerrellaError where nothing moves."""
+    """A tracker of what moves in uint8 pictures [F, H, W, 3] from one camera that stands still, by masks int [F, h, w]: the number
+    of what is seen at each pixel. TerrellaError where nothing moves."""
     rows = torch.linspace(0, len(pictures) - 1, min(len(pictures), SHOWN)).long()
     some = pictures[rows].float()
     numbers = F.interpolate(masks[rows, None].float(), size=some.shape[1:3], mode="nearest")[:, 0].long()

@@ -95,9 +95,9 @@ def fit_tracked(
     metres_per_pixel: float | None = None,
     masks: Tensor | None = None,
 ) -> Tracked:
-    """What tracks a recording's things, from uint8 pictures [T + 1, B, H, W, 3] of it, and from masks int [T + 1, B, h, w] that number
-    what is seen at each pixel, where they are recorded.
+    """What tracks a recording's things, from uint8 pictures [T + 1, B, H, W, 3] of it.
 
+    masks int [T + 1, B, h, w], the number of what is seen at each pixel, say what moves, where they are recorded.
     The scale is `metres_per_pixel`, else of `positions` [T + 1, B, N, 2] of the system's bodies in their plane, else of gravity,
     where things fall freely. The bodies are the system's where it is from positions, else things of which nothing is known.
     TerrellaError where none of them gives a scale, or where nothing can be tracked."""

@@ -154,7 +154,8 @@ class BodiesWorld:
     """`BodiesWorld("bouncing")`: a family of FAMILIES. It has one action, to wait.
 
     Channels: position [2 N] (x, z of each ball, m), velocity [2 N] (m/s), radius [N] (m), spin [N] (rad/s, where the family has
-    one), rgb, segmentation (the number of the ball at each pixel, -1 for none), done. A state follows from its channels: `observe` sets it. TerrellaError for an unknown family."""
+    one), rgb, segmentation (the number of the ball at each pixel, -1 for none), done.
+    A state follows from its channels: `observe` sets it. TerrellaError for an unknown family."""
 
     def __init__(self, family: str, config: BodiesConfig = BodiesConfig()):
         if family not in FAMILIES:

@@ -116,8 +116,8 @@ def measure_geometry(world: str, config: GeometryConfig, *, progress: Progress =
     known = clips_from_cache(cache, train, CONTEXT, ROWS, KNOWN, rng, advice=advice)
     if len(known) < LEAST or len(clips) < FEWEST:
         raise DatasetError(
-            f"{config.data} has {len(clips)} stretches of {config.steps} steps held out of training and {len(known)} others; {FEWEST} "
-            f"and {LEAST} are needed. Record more, take fewer --steps, or --fresh where training never saw the recording."
+            f"{config.data} has {len(clips)} stretches of {config.steps} steps held out of training and {len(known)} others; "
+            f"{FEWEST} and {LEAST} are needed. Record more, take fewer --steps, or --fresh where training never saw the recording."
         )
     return geometry_of(opened, clips, known, config.seed)
 

@@ -36,7 +36,7 @@ def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
     why = f"there it expects an error of {forecast.level:.2g}, half way to chance"
     why = "there its error was measured to be half way to chance" if forecast.measured else why
     progress(
-        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: {why}. Its {what} end there; --trust sets "
-        "another limit."
+        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: {why}. Its {what} end there; --trust "
+        "sets another limit."
     )
     return forecast.steps
