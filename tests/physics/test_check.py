@@ -1,5 +1,6 @@
 """`check` from outside: the truth passes, a world that invents is accused, and bad input gets a sentence."""
 
+import dataclasses
 import json
 
 import pytest
@@ -13,6 +14,7 @@ from terrella.measure.physics import examine_physics, physics_verdict
 from terrella.measure.physics_film import film_of_bodies
 from terrella.measure.physics_page import physics_page
 from terrella.physics import PhysicalSystem, trajectory_of
+from terrella.physics.laws.non_penetration import begins_inside
 from terrella.sim.bodies import BodiesConfig, BodiesWorld
 from terrella.workflows.check import CheckConfig, check
 
@@ -78,6 +80,21 @@ def test_films_show_the_body_where_it_is():
     frames = film_of_bodies(trajectory_of(system, seen, dt_s))
     assert frames.shape == (25, 220, 220, 3)
     assert len({frame.tobytes() for frame in frames}) > 20
+
+
+def test_bodies_that_begin_inside_each_other_are_named(recording, tmp_path):
+    truth = trajectory_of(*motion("collision", 1, 6))
+    assert begins_inside(truth, 1e-3) == ""
+    inside = truth.position.clone()
+    inside[0, 2, 1] = inside[0, 2, 0] + 0.01
+    words = begins_inside(dataclasses.replace(truth, position=inside), 1e-3)
+    assert words.startswith("ball 1 begins 0.") and "m inside ball 2, and 1 of 6 true rollouts" in words
+    system = BodiesWorld("bouncing").family.system
+    large = dataclasses.replace(system.bodies[0], radius_m=0.7)
+    (tmp_path / "large.json").write_text(json.dumps(dataclasses.replace(system, bodies=(large,)).to_json()))
+    config = CheckConfig(recording, system=str(tmp_path / "large.json"), out=tmp_path, steps=8, rollouts=4)
+    result = check("physics:bouncing", config)
+    assert "inside a wall, and" in result.summary() and "the truth itself breaks it" in result.summary()
 
 
 def test_bad_input_gets_a_sentence(recording, tmp_path):

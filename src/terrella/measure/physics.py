@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,6 +13,7 @@ from ..core.world import make_rng
 from ..physics import LAWS, Certificates, Tolerance, Trajectory, calibrate, certify
 from ..physics.constants import CONSTANTS
 from ..physics.laws.energy import energy, energy_scale
+from ..physics.laws.non_penetration import NonPenetration, begins_inside
 from ..physics.tolerance import detection
 from .statistics import Band, Figure, clopper_pearson, mean_band, mean_interval, median_interval, ratio_interval
 
@@ -113,8 +114,17 @@ def examine_physics(
     horizon, wide_horizon = (median_interval(one.horizon.double(), rng) for one in (strict, loose))
     return PhysicsReport(
         name, dream.batch, dream.steps, dream.dt_s, laws, missing, constants, spread, deviation, horizon, wide_horizon, change,
-        _worst(loose, truth, dream),
+        _worst(loose, truth, dream), _begun_inside(tolerances, known, truth),
     )  # fmt: skip
+
+
+def _begun_inside(tolerances: Sequence[Tolerance], *true: Trajectory) -> tuple[str, ...]:
+    """What to say of true rollouts that begin with an overlap beyond what the law allows, or can mean."""
+    for one in tolerances:
+        if isinstance(one.law, NonPenetration):
+            said = (begins_inside(motion, min(one.value, one.law.ceiling(motion))) for motion in true)
+            return tuple(words for words in said if words)[:1]
+    return ()
 
 
 def _law(one: Tolerance, wide: Tolerance, others: Trajectory, dream: Trajectory, seed: int) -> LawReport:

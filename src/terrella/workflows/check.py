@@ -129,7 +129,9 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
         truth, others = (_true_motion(described, some, opened.spec) for some in (clips, known))
         mine = dream_motion(opened, described, clips, config.steps, chance)
     report = examine_physics(opened.spec.name, others, truth, mine, config.seed, config.coarse)
-    return _written(dataclasses.replace(report, notes=notes), config.out or Path("checks") / folder_name(world))
+    return _written(
+        dataclasses.replace(report, notes=(*notes, *report.notes)), config.out or Path("checks") / folder_name(world)
+    )
 
 
 def _most_known(spec: Spec, length: int) -> int:

@@ -14,6 +14,23 @@ PUSHES = 3  # of a correction
 APPROACHES = 8  # of an injected overlap to its depth
 
 
+def begins_inside(motion: Trajectory, allowed: float) -> str:
+    """A sentence on the body that is deepest inside another one or a wall at the first instant, by more than `allowed` m; "" where
+    none is."""
+    names = [body.name for body in motion.system.bodies]
+    gaps = torch.cat([motion.body_gaps[0], motion.wall_gaps[0]], 2)  # [B, N, N + W]
+    depth = (-gaps).masked_fill(~motion.present[0][..., None], 0.0)
+    deep = depth.flatten(1).amax(1)
+    if not float(deep.max()) > allowed:
+        return ""
+    body, other = divmod(int(depth[deep.argmax()].argmax()), gaps.shape[2])
+    what = names[other] if other < len(names) else "a wall"
+    return (
+        f"{names[body]} begins {float(deep.max()):.2g} m inside {what}, and {int((deep > allowed).sum())} of {len(deep)} true "
+        "rollouts begin with such an overlap: describe sizes, positions and walls as they are."
+    )
+
+
 class NonPenetration:
     """The depth of the deepest overlap at the end of each step."""
 
