@@ -30,7 +30,7 @@ START, FREE, CARRIES = 0, 1, 2  # what the one channel of these tests holds
 class Known(SkillLibrary):
     """Its predictions are a rule: nothing but going begins while something is carried, and blue things suit it half as often."""
 
-    def outlook(self, seen, texts, memory=None):
+    def outlook(self, seen, texts, memory=None, waypoints=None):
         suits = []
         for value, text in zip(seen["hand"][:, 0].tolist(), texts):
             carried = 0.01 if value == CARRIES and not text.startswith("go") else 1.0
@@ -39,7 +39,7 @@ class Known(SkillLibrary):
         return SkillOutlook(logits, logits * 0, logits * 0 + 1)
 
 
-def library_of(kind=Known):
+def library_of(kind: type[SkillLibrary] = Known) -> SkillLibrary:
     torch.manual_seed(0)
     actor = ActorConfig((("hand", (1,)),), "choice", (), (0.0,), (2.0,), hidden=8)
     network = ImitationNetwork(ImitationConfig(actor, vocabulary=vocabulary_of(TEXTS), history=1)).eval()
@@ -47,7 +47,7 @@ def library_of(kind=Known):
     texts = (*TEXTS, "", "")
     hands = [CARRIES if text.startswith("pick") else FREE if text else START for text in texts]
     ends = {"hand": torch.tensor(hands)[:, None].float()}
-    predictor = SkillPredictor(network.recalled_width, network.words.width)
+    predictor = SkillPredictor(network)
     return kind(skills, network, predictor, ends, texts)
 
 
@@ -80,7 +80,7 @@ def test_phrases_have_places_where_words_stand_for_each_other():
         ("Go to A, then pick up B and drop it, and then wait.", (("go to a",), ("pick up b", "drop it"), ("wait",))),
         ("go to a after you pick up b and pick up c", (("pick up b", "pick up c"), ("go to a",))),
         ("a and b, then c after you d", (("a", "b"), ("d",), ("c",))),
-        ("a, b; c", (("a", "b"), ("c",))),
+        ("a, b and c; d", (("a",), ("b", "c"), ("d",))),
         ("After you have a and b, c and d", (("a", "b"), ("c", "d"))),
         ("a, after that b. Afterwards c", (("a",), ("b",), ("c",))),
         (" . ", ()),
@@ -88,6 +88,19 @@ def test_phrases_have_places_where_words_stand_for_each_other():
 )
 def test_a_goal_is_groups_of_phrases_in_order(text, groups):
     assert goal_of(text) == groups
+
+
+def test_what_a_phrase_leaves_out_is_named_before():
+    said = "go to the red key, put the red box next to, then go to it and pick it up"
+    assert SkillSearch(library_of()).instructions_of(said) == (
+        (("go to the red key",),),
+        (("put the red box next to the red key",),),
+        (("go to the red box",), ("pick up the red box",)),
+    )
+    assert goal_of("grasp a and lift it, b and c", lambda phrase: phrase.startswith("grasp")) == (
+        ("grasp a and lift it",),
+        ("b", "c"),
+    )
 
 
 def test_the_likeliest_order_is_found():

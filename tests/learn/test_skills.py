@@ -14,11 +14,13 @@ from tests.learn.stopping import quiet
 from tests.learn.test_imitation import COLOURS, QUICK, teacher
 
 import terrella
+from terrella.act.imitation import load_imitation_network
 from terrella.act.skills.actor import SkillActor
 from terrella.cli import main
 from terrella.core.errors import PlanningError
 from terrella.core.world import make_rng
 from terrella.data import record
+from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
 from terrella.learn.recipes.skills import Segments
 from terrella.sim.gymnasium import GymnasiumWorld
@@ -103,6 +105,11 @@ def test_skills_are_learned_from_long_recordings_and_planned_with(library, capsy
     opened, _ = open_demonstrations(library[1], ("grid",), (64, 64), quiet)
     segments = Segments.of(opened)
     assert len(segments.first) > 2.5 * len(opened.cache.episodes) and segments.success[:-1].all()
+    config = load_imitation_network(library[2] / "policy")[0].config
+    rows = DemonstrationRows.of(opened, replace(config, remember=0, history=1, chunk=3), torch.device("cpu"))
+    assert segments.end[0] == segments.first[1], "the first errand of an episode"
+    weight = rows.at(segments.end[:1] - np.array([3, 2, 1])).weight
+    assert weight.tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0]], "what follows is of another instruction"
     assert learned(library, "--json") == 0
     facts = json.loads(capsys.readouterr().out)
     assert [one["phrase"] for one in facts["skills"]] == ["go to the blue|red ball"]
@@ -176,11 +183,14 @@ def test_a_person_types_a_goal_of_several_steps_on_the_page(library):
     agents = PageAgents(world, name=str(library[0])).agents()
     state = world.start(1, make_rng(3))
     goal = "go to the blue ball, then go to the red ball"
-    agent = agents.make(agents.words(goal))
+    make, words = agents.make, agents.words
+    assert make is not None and words is not None
+    agent = make(words(goal))
+    assert agent.see is not None
     _, memory = agent.policy.act(agent.see(state), agent.policy.begin(1, make_rng(0)), make_rng(0))
     assert memory[0].goal == goal and [step.text for step in memory[0].plan.steps] == goal.split(", then ")
     with pytest.raises(PlanningError, match="no skill does 'ball ball'"):
-        agents.words("ball ball")
+        words("ball ball")
 
 
 def test_an_actor_of_many_episodes_is_as_of_each_alone(library):

@@ -160,14 +160,14 @@ class DemonstrationRows:
         before = torch.from_numpy((back - 1).clip(start[:, None], self.stop[rows][:, None] - 1))
         taken = self.actions if self.taken is None else self.taken
         acted = torch.where(torch.from_numpy(back - 1 >= start[:, None])[..., None], taken[before], 0.0)
+        began, until = self._instructed(rows)
         ahead = rows[:, None] + np.arange(config.chunk)
-        valid = torch.from_numpy(ahead < self.stop[rows][:, None])
+        valid = torch.from_numpy(ahead < until[:, None])  # what follows is of another instruction
         ahead = np.minimum(ahead, self.stop[rows][:, None] - 1)
         valid &= torch.from_numpy(self.valid[ahead])
         weight = valid.float() if self.weight is None else valid * self.weight[torch.from_numpy(ahead)]
         chunk = self.actions[torch.from_numpy(ahead)]
-        began, last = self._instructed(rows)
-        last = np.minimum(last, self.stop[rows] - 1)
+        last = np.minimum(until, self.stop[rows] - 1)
         later = (np.minimum(began + config.waypoint, last), last)[: config.waypoints]
         waypoints = tuple(self.observations(at, numbers_only=True) for at in later)
         begins = torch.from_numpy(self._begins(rows)).float().to(self.device) if config.waypoint else None

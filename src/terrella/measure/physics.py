@@ -122,8 +122,8 @@ def _begun_inside(tolerances: Sequence[Tolerance], *true: Trajectory) -> tuple[s
     """What to say of true rollouts that begin with an overlap beyond what the law allows, or can mean."""
     for one in tolerances:
         if isinstance(one.law, NonPenetration):
-            said = (begins_inside(motion, min(one.value, one.law.ceiling(motion))) for motion in true)
-            return tuple(words for words in said if words)[:1]
+            sentences = (begins_inside(motion, min(one.value, one.law.ceiling(motion))) for motion in true)
+            return tuple(words for words in sentences if words)[:1]
     return ()
 
 

@@ -18,10 +18,11 @@ from .mujoco_pilot import Multirotor, Pilot
 from .mujoco_tasks import Free, Hold, Reach, RobotTask, Stepping, VelocityTracking
 from .mujoco_town import YAWS_DEG, build_town
 from .road_network import road_network
+from .table_chains import TableChain
 from .table_hand import TableHand
 from .table_scene import TableArm, table_scene
 from .table_tasks import TableTask
-from .table_words import TASKS
+from .table_words import ALONE, TASKS
 
 ZOO = "mjlab/asset_zoo/robots/"
 GYMNASIUM = "gymnasium/envs/mujoco/assets/"
@@ -209,14 +210,23 @@ def _at_blocks(file: str, what: str, arm: TableArm, servos: Mapping[str, Servo] 
     def only(*names: str) -> Callable[[Robot, str], Robot]:
         return lambda robot, variant: replace(robot, task=replace(one, tasks=names, unseen=bool(variant)))
 
+    def chained(whole: bool) -> Callable[[Robot, str], Robot]:
+        chain = TableChain(closed_m=arm.closed_m, whole=whole)
+        return lambda robot, variant: replace(robot, task=replace(chain, unseen=bool(variant)), max_steps=CHAIN_STEPS)
+
+    def free(robot: Robot, variant: str) -> Robot:
+        return replace(robot, task=replace(one, free=True), max_steps=CHAIN_STEPS)
+
+    chains = {"chain": chained(False), "sentence": chained(True), "free": free}
     return Robot(
         file, f"{what} at a table with three blocks, a cup and a drawer, that gets instructions", one, servos or {}, pose=arm.pose,
         adds=table_scene(arm), control_s=0.1, max_steps=100, pilot=TableHand, cameras=("front", "wrist"), size=(96, 96),
         hides=("qpos", "qvel", "contacts", "sensor"), variant="unseen",
-        tasks={"all": only(*TASKS)} | {name: only(name) for name in TASKS},
+        tasks={"all": only(*ALONE)} | {name: only(name) for name in TASKS} | chains,
     )  # fmt: skip
 
 
+CHAIN_STEPS = 300  # of an episode of three tasks, at most
 TABLE_M = 0.75  # height of the arm's table
 _LOOK = [0.62, 0.78, 0, -0.4, 0.32, 0.86]  # axes of its camera
 _LEG = Servo(35.0, 1.0, 23.7, 0.0040, 0.4)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from ..core import chance
-from ..core.instruction import embed
+from ..core.instruction import embed, text_to_bytes
 from ..core.spec import EVENT, INSTRUCTION, TEXT
 from .mujoco_tasks import Evaluation, RobotLayout, Spaces, Tensors, numbers
 from .table_hand import SPEED
 from .table_scene import BLOCK_M, COLOURS, CUP_M, DRAWER_M, HANDLE, PLACED, WALL_M
-from .table_teacher import ABOVE_M, TableState, advice
-from .table_words import TASKS, text_bytes, text_of
+from .table_teacher import ABOVE_M, TableState, advice, drawer_of
+from .table_words import ALONE, TASKS, text_of
 
 BLOCKS = ((-0.14, -0.09), (0.05, 0.07))  # corners of the area where blocks begin, m
 CUPS, SHIFT_M = ((-0.1, -0.255), (0.05, -0.225)), 0.02  # corners of the cup's area; by how much the cabinet is shifted
@@ -39,7 +39,8 @@ class TableTask:
     drawer's opening; its handle): policies do not see these unless they are named."""
 
     rewards = True
-    tasks: tuple[str, ...] = TASKS  # an episode draws one of these
+    tasks: tuple[str, ...] = ALONE  # an episode draws one of these
+    free: bool = False  # no instruction, and no end but that of time: for those who give their own
     unseen: bool = False  # whether instructions have wordings that are held out from training
     closed_m: float = 0.0  # gap between the fingers where both slides are at 0
 
@@ -58,26 +59,27 @@ class TableTask:
         block, side = (drawn[:, 1] * count).long(), (drawn[:, 3] * 2).long()
         other = (block + 1 + (drawn[:, 2] * (count - 1)).long()) % count
         job = torch.stack([known[(drawn[:, 0] * len(known)).long()], block, other, side], 1)
-        blocks = self._arranged(seeds, job)
+        opened = job[:, 0] == TASKS.index("close")
+        kept = self._placed(seeds, job, opened | (job[:, 0] == TASKS.index("store")), qpos)
+        wording = (3 * chance.uniform(seeds, (), _WORDS)).long()
+        return {**kept, "job": job, "wording": wording}
+
+    def _placed(self, seeds: Tensor, job: Tensor, opened: Tensor, qpos: Tensor) -> dict[str, Tensor]:
+        """Draws where things are into `qpos`, with room for the jobs [B, 4]. Returns what the state keeps of that."""
+        count, blocks = len(COLOURS), self._arranged(seeds, job)
         rest = chance.uniform(seeds, (4,), _LEFT_OPEN).double()
         cup = _within(rest[:, :2], CUPS)
         upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(len(seeds), count, 4)
         placed = torch.cat([blocks, torch.full((len(seeds), count, 1), BLOCK_M), upright], 2).flatten(1)
         placed = torch.cat([placed, cup, torch.full((len(seeds), 1), WALL_M / 2), upright[:, 0]], 1)
         shut = 0.15 * DRAWER_M * rest[:, 3]
-        opening = torch.where(job[:, 0] == TASKS.index("close"), DRAWER_M * (0.7 + 0.3 * rest[:, 3]), shut)
+        opening = torch.where(opened, DRAWER_M * (0.7 + 0.3 * rest[:, 3]), shut)
         shift = SHIFT_M * (2 * rest[:, 2] - 1)
         qpos[:, -PLACED:] = torch.cat([placed, shift[:, None], opening[:, None]], 1)
-        wording = (3 * chance.uniform(seeds, (), _WORDS)).long()
-        return {"job": job, "wording": wording, "began": blocks, "success": torch.zeros(len(seeds), dtype=torch.bool)}
+        return {"began": blocks, "success": torch.zeros(len(seeds), dtype=torch.bool)}
 
     def evaluate(self, layout: RobotLayout, before: Tensors, after: Tensors) -> Evaluation:
-        scene = self.scene(layout, after)
-        done = torch.stack(
-            [self._reached(scene), self._pushed(scene), scene.target[:, 2] > LIFTED_M, self._placed(scene),
-             scene.opening > OPEN_M, scene.opening < SHUT_M, self._stacked(scene)], 1,
-        )  # fmt: skip
-        success = done.gather(1, scene.job[:, :1])[:, 0]
+        success = self.succeeded(self.scene(layout, after)) & (not self.free)
         return (
             success.float(),
             success,
@@ -88,9 +90,8 @@ class TableTask:
         if name == "success":
             return state["success"]
         if name in ("text", "instruction"):
-            rows = zip(state["job"].tolist(), state["wording"].tolist())
-            read = text_bytes if name == "text" else lambda *job: embed(text_of(*job))
-            return torch.from_numpy(np.stack([read(tuple(job), wording, self.unseen) for job, wording in rows]))
+            read = text_to_bytes if name == "text" else embed
+            return torch.from_numpy(np.stack([read(text) for text in self.texts(state)]))
         if name in ("joints", "joint_speeds"):
             part, own = (layout.qpos, layout.hinges[0]) if name == "joints" else (layout.qvel, layout.hinges[1])
             return state["physics"][:, part][:, own[:-2]].float()
@@ -100,6 +101,11 @@ class TableTask:
         if name == "expert":
             return advice(scene, SPEED, layout.step_s).float()
         return torch.cat([scene.blocks.flatten(1), scene.cup, scene.opening[:, None], scene.handle], 1).float()
+
+    def texts(self, state: Tensors) -> list[str]:
+        """What each state asks for now."""
+        rows = zip(state["job"].tolist(), state["wording"].tolist())
+        return ["" if self.free else text_of(tuple(job), wording, self.unseen) for job, wording in rows]
 
     def scene(self, layout: RobotLayout, state: Tensors) -> TableState:
         """Where everything is."""
@@ -115,6 +121,14 @@ class TableTask:
 
     # -- success ------------------------------------------------------------------------------------------------------
 
+    def succeeded(self, scene: TableState) -> Tensor:
+        """bool [B]: whether the job that is due is done."""
+        done = torch.stack(
+            [self._reached(scene), self._pushed(scene), scene.target[:, 2] > LIFTED_M, self._in_cup(scene),
+             scene.opening > OPEN_M, scene.opening < SHUT_M, self._stacked(scene), self._stored(scene)], 1,
+        )  # fmt: skip
+        return done.gather(1, scene.job[:, :1])[:, 0]
+
     def _reached(self, scene: TableState) -> Tensor:
         above = scene.target + torch.tensor([0, 0, ABOVE_M], dtype=torch.float64)
         return (scene.hand - above).norm(dim=1) < NEAR_M
@@ -124,9 +138,14 @@ class TableTask:
         x, y = (scene.target[:, :2] - scene.target_began).unbind(1)
         return (y * scene.way > PUSHED_M) & (x.abs() < 0.04) & (scene.target[:, 2] < 1.5 * BLOCK_M)
 
-    def _placed(self, scene: TableState) -> Tensor:
+    def _in_cup(self, scene: TableState) -> Tensor:
         inside = (scene.target[:, :2] - scene.cup[:, :2]).abs().amax(1) < CUP_M
         return inside & (scene.target[:, 2] < 0.04) & (scene.gap > LET_GO_M)
+
+    def _stored(self, scene: TableState) -> Tensor:
+        """In the drawer, on its bottom."""
+        apart = (scene.target - drawer_of(scene)).abs()
+        return (apart[:, 0] < DRAWER_M / 2) & (apart[:, 1] < 0.045) & (apart[:, 2] < 0.012) & (scene.gap > LET_GO_M)
 
     def _stacked(self, scene: TableState) -> Tensor:
         apart = scene.target - scene.under

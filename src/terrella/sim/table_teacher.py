@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .table_scene import BLOCK_M, FIN_M
+from .table_scene import BLOCK_M, FIN_M, HANDLE
 
 GAIN = 4.0  # 1/s, of the distance to where the hand should be
 HOVER_M, GRASP_M, LOW_M = (
@@ -19,6 +19,11 @@ FUNNEL = 3.0  # height above the goal by the distance to it, while the hand come
 CLOSED_M = 0.003  # by which fingers around something are farther apart than it is wide, when they hold it
 BEHIND_M = 0.05  # of a block that is pushed, of its middle
 CARRY_M = 0.085  # height of the tip over the cup
+IN_DRAWER_M, BOTTOM_M, OVER_M = (
+    0.085,
+    0.03,
+    0.06,
+)  # where a block lies in the drawer: behind the handle, and its middle's height; by how much higher it is let go
 ABOVE_M = 0.045  # of the tip, of the middle of a block that it reaches
 OPEN, CLOSE = 1.0, -1.0
 
@@ -58,7 +63,7 @@ class TableState:
 
 def advice(scene: TableState, speed: float, step_s: float) -> Tensor:
     """The action [B, 4] for each state: velocities of up to `speed` m/s, and the gripper. step_s: seconds of a step."""
-    plans = (_reach, _push, _pick, _place, _open, _close, _stack)
+    plans = (_reach, _push, _pick, _place, _open, _close, _stack, _store)
     every = torch.stack([plan(scene) for plan in plans], 1)  # [B, tasks, 4]: where the tip should go, and the gripper
     plan = _of(every, scene.job[:, 0])
     velocity = GAIN * (plan[:, :3] - scene.hand)
@@ -142,6 +147,15 @@ def _place(scene: TableState) -> Tensor:
 
 def _stack(scene: TableState) -> Tensor:
     return _set_down(scene, _raised(scene.under, 2 * BLOCK_M + 0.003), 0.007)
+
+
+def drawer_of(scene: TableState) -> Tensor:
+    """[B, 3], where the middle of a block is that lies in the drawer, behind its front."""
+    return scene.handle + scene.handle.new_tensor([IN_DRAWER_M, 0, BOTTOM_M - HANDLE[2]])
+
+
+def _store(scene: TableState) -> Tensor:
+    return _set_down(scene, _raised(drawer_of(scene), OVER_M), 0.015)
 
 
 def _open(scene: TableState) -> Tensor:

@@ -2,9 +2,6 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from ..core.instruction import text_to_bytes
 from .table_scene import COLOURS
 
 SIDES = ("left", "right")  # as the front camera sees them
@@ -40,8 +37,14 @@ WORDINGS: Mapping[str, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
         ("put the {a} block on top of the {b} block", "place the {a} block on the {b} block",
          "stack the {a} block on top of the {b} block"),
     ),
+    "store": (
+        ("put the {a} block in the drawer", "place the {a} block in the drawer", "drop the {a} block into the drawer"),
+        ("put the {a} block into the drawer", "drop the {a} block in the drawer",
+         "pick up the {a} block and place it in the drawer"),
+    ),
 }  # fmt: skip
 TASKS = tuple(WORDINGS)
+ALONE = TASKS[:-1]  # of which an episode of one task draws; `store` needs an open drawer, and comes in chains
 
 
 def text_of(job: tuple[int, int, int, int], wording: int, unseen: bool) -> str:
@@ -49,8 +52,3 @@ def text_of(job: tuple[int, int, int, int], wording: int, unseen: bool) -> str:
     task, block, other, side = job
     colours = tuple(COLOURS)
     return WORDINGS[TASKS[task]][unseen][wording].format(a=colours[block], b=colours[other], side=SIDES[side])
-
-
-def text_bytes(job: tuple[int, int, int, int], wording: int, unseen: bool) -> np.ndarray:
-    """The same as the channel `text` has it."""
-    return text_to_bytes(text_of(job, wording, unseen))

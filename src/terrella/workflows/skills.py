@@ -112,6 +112,7 @@ class SkillEpisode:
     reward: float
     steps: int
     ended: bool = False  # by the environment, before all were done
+    success: bool | None = None  # by the environment's channel `success`, if it has one
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ class SkillPlanResult:
 
     @property
     def rewarded(self) -> Figure:
-        return wilson(sum(one.reward > 0 for one in self.episodes), len(self.episodes))
+        won = [one.reward > 0 if one.success is None else one.success for one in self.episodes]
+        return wilson(sum(won), len(won))
 
     def to_json(self) -> dict[str, Any]:
         shares = {"finished": asdict(self.finished), "rewarded": asdict(self.rewarded)}
@@ -136,7 +138,9 @@ class SkillPlanResult:
 
     def summary(self) -> str:
         lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
-        lines += [] if self.goal else [f"The environment rewarded {self.rewarded}."]
+        if not self.goal:
+            mean = sum(one.reward for one in self.episodes) / len(self.episodes)
+            lines.append(f"By the environment's own rules {self.rewarded} succeeded; their mean return is {mean:.2f}.")
         if ended := sum(one.ended for one in self.episodes):
             lines.append(f"The environment ended {ended} of {len(self.episodes)} before, by rules of its own.")
         for number, one in enumerate(self.episodes[:3], 1):
@@ -248,17 +252,16 @@ def _worlds(name: str, config: PlanConfig, progress: Progress) -> tuple[World | 
 @torch.no_grad()
 def _episode(world: World, state: Any, actor: SkillActor, steps: int, rng: torch.Generator) -> SkillEpisode:
     """One episode; it ends when the plan is done, the environment ends it, or after `steps` steps."""
-    outcome = [name for name in ("reward", "done") if name in world.spec.channels]
-    channels, memory, reward = (*actor.sees, *outcome), actor.begin(1, rng), 0.0
-    seen = world.render(state, channels)
-    for step in range(steps):
-        action, memory = act(actor, seen, memory, 1, world.spec, rng)
-        if memory[0].finished:
-            return SkillEpisode(memory[0].events, True, reward, step)
-        state = world.imagine(state, action, rng)
+    outcome = [name for name in ("reward", "done", "success") if name in world.spec.channels]
+    step, over, channels = 0, False, (*actor.sees, *outcome)
+    memory, reward, seen = actor.begin(1, rng), 0.0, dict[str, torch.Tensor]()
+    for step in range(steps + 1):
         seen = world.render(state, channels)
-        reward += float(seen["reward"]) if "reward" in seen else 0.0
-        if "done" in seen and bool(seen["done"]):
-            _, memory = act(actor, seen, memory, 1, world.spec, rng)
-            return SkillEpisode(memory[0].events, memory[0].finished, reward, step + 1, not memory[0].finished)
-    return SkillEpisode(memory[0].events, False, reward, steps)
+        reward += float(seen["reward"]) if step and "reward" in seen else 0.0
+        action, memory = act(actor, seen, memory, 1, world.spec, rng)
+        over = bool(seen["done"]) if step and "done" in seen else False
+        if memory[0].finished or over or step == steps:
+            break
+        state = world.imagine(state, action, rng)
+    one, success = memory[0], bool(seen["success"]) if "success" in seen else None
+    return SkillEpisode(one.events, one.finished, reward, step, over and not one.finished and not success, success)

@@ -63,7 +63,8 @@ class SkillActor:
             goals = [bytes_to_text(row.numpy()) for row in observation[TEXT].cpu()]
         fast, texts = State.stack([one.fast for one in memory]), [one.text for one in memory]
         hidden = fast["features"][:, 0].to(self.library.network.mean.device) if self.library.network.memory else None
-        done = self.library.outlook(seen, texts, hidden).done.cpu() > self.library.threshold
+        waypoints = fast["waypoints"].to(self.library.network.mean.device) if self.library.network.waypoints else None
+        done = self.library.outlook(seen, texts, hidden, waypoints).done.cpu() > self.library.threshold
         memory = [
             self._thought(one, str(goal), bool(over), {name: value[row : row + 1] for name, value in seen.items()})
             for row, (one, goal, over) in enumerate(zip(memory, goals, done.tolist()))

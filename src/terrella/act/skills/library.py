@@ -97,13 +97,21 @@ class SkillLibrary:
         return replace(self, skills=tuple(skill if one.name == name else one for one in self.skills))
 
     @torch.no_grad()
-    def outlook(self, seen: Observation, texts: Sequence[str], memory: torch.Tensor | None = None) -> SkillOutlook:
-        """What observations [N, ...] promise for N instructions. memory: the policy's [N, hidden], None where they begin."""
+    def outlook(
+        self,
+        seen: Observation,
+        texts: Sequence[str],
+        memory: torch.Tensor | None = None,
+        waypoints: torch.Tensor | None = None,
+    ) -> SkillOutlook:
+        """What observations [N, ...] promise for N instructions. memory: the policy's [N, hidden], and its waypoints
+        [N, waypoints, D]; None where they begin."""
         words = self.network.words
         assert words is not None
         spoken = words(words.read(texts).to(self.network.mean.device))
-        recalled, _ = self.network.recall(self.network.features(seen, spoken)[:, None], memory)
-        return self.predictor(recalled[:, 0], spoken)
+        features = self.network.features(seen, spoken)[:, None]
+        waypoints = self.network.foreseen(features, spoken) if waypoints is None else waypoints
+        return self.predictor(self.network.recall(features, memory)[0][:, 0], spoken, waypoints)
 
     def skill_of(self, text: str) -> Skill | None:
         """The skill of a whole instruction."""
@@ -139,9 +147,7 @@ class SkillLibrary:
         if not (folder / POLICY_FILE).is_file() or read_policy(folder).get("kind") != KIND:
             raise CheckpointError(f"{folder} holds no skills; make a library of them with: terrella skills learn.")
         network, _ = load_imitation_network(folder / FAST_FOLDER)
-        assert network.words is not None
-        widths = network.recalled_width, network.words.width
-        predictor, card = load_network(folder, KIND, VERSION, lambda _: SkillPredictor(*widths))
+        predictor, card = load_network(folder, KIND, VERSION, lambda _: SkillPredictor(network))
         try:
             config, ends = read_policy(folder)["config"], load_file(folder / ENDS_FILE)
             skills = tuple(

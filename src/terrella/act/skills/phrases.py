@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from ...core.errors import PlanningError
@@ -17,7 +17,10 @@ MOST_FILLINGS = 64  # instructions that a phrase with open places stands for, at
 _THEN = re.compile(r"[,;.]?\s*\b(?:and\s+)?(?:then|after\s+that|afterwards)\b[\s,]*|[;.]\s*")
 _FIRST = re.compile(r"^after\s+(.+?),\s*(.+)$")  # "after A, B" is "B after A"
 _AFTER = re.compile(r"[,]?\s*\bafter\s+(?:you\s+)?(?:have\s+)?")
-_AND = re.compile(r"\s*,\s*(?:and\s+)?|\s+and\s+")
+_COMMA = re.compile(r"\s*,\s*(?:and\s+)?")
+_AND = re.compile(r"\s+and\s+")
+PRONOUNS = ("it", "them", "there")
+MOST_NAMED = 4  # words of a thing that a phrase names: "the small red ball"
 
 
 @dataclass(frozen=True)
@@ -92,12 +95,29 @@ def phrases_of(texts: Iterable[str]) -> dict[Phrase, list[str]]:
     return phrases
 
 
-def goal_of(text: str) -> tuple[tuple[str, ...], ...]:
-    """The phrases of a goal, in groups: the groups in their order, the phrases of a group in any. "A and B, then C", "C after
-    you A and B" and "after you A and B, C" are ((A, B), (C,))."""
+def goal_of(text: str, whole: Callable[[str], bool] = lambda phrase: False) -> tuple[tuple[str, ...], ...]:
+    """The phrases of a goal, in groups: the groups in their order, the phrases of a group in any. "A and B, then C", "A and B, C",
+    "C after you A and B" and "after you A and B, C" are ((A, B), (C,)). whole: whether a phrase with "and" is one instruction."""
     groups: list[tuple[str, ...]] = []
     for part in _THEN.split(text.strip().lower()):
         for each in reversed(_AFTER.split(_FIRST.sub(r"\2 after \1", part.strip()))):
-            phrases = tuple(phrase.strip() for phrase in _AND.split(each) if words_of(phrase))
-            groups += [phrases] if phrases else []
+            for one in _COMMA.split(each):
+                parts = [one] if whole(one) else _AND.split(one)
+                phrases = tuple(phrase.strip() for phrase in parts if words_of(phrase))
+                groups += [phrases] if phrases else []
     return tuple(groups)
+
+
+def things_of(phrase: str) -> list[str]:
+    """What a phrase names, in its order: an article and the words after it, more of them first ("the red ball", "the red")."""
+    words = words_of(phrase)
+    ends = [(at, end) for at in range(len(words)) for end in range(at + MOST_NAMED, at + 1, -1) if end <= len(words)]
+    return [" ".join(words[at:end]) for at, end in ends if words[at] in ARTICLES]
+
+
+def completed(phrase: str, things: Iterable[str]) -> list[str]:
+    """The phrase with each of these things in the place of its pronoun, or at its end ("put the ball in", "pick it up")."""
+    words = words_of(phrase)
+    at = next((at for at, word in enumerate(words) if word in PRONOUNS), len(words))
+    before, after = words[:at], words[at + 1 :]
+    return [" ".join(each) for thing in things for each in ([*before, thing, *after], [*before, *after, thing])]

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from ..actor_network import mlp
+from ..imitation_network import ImitationNetwork
 
 MOST_LOG_STEPS = 8.0
 
@@ -27,13 +28,21 @@ class SkillOutlook:
 
 
 class SkillPredictor(nn.Module):
-    """A small network on what an imitating policy sees and remembers, and on the features of the instruction."""
+    """A small network on what an imitating policy sees and remembers, on the features of the instruction, and on how far the
+    policy's numbers (the hand) are from the waypoints that it expected when the instruction began."""
 
-    def __init__(self, width: int, words: int, hidden: int = 128):
+    def __init__(self, network: ImitationNetwork, hidden: int = 128):
         super().__init__()
-        self.layers = mlp(width + words, hidden, 2, 3, gain=0.1)
+        words = network.words.width if network.words is not None else 0
+        self.numbers = len(network.mean)
+        ahead = len(network.waypoints) * self.numbers
+        self.layers = mlp(network.recalled_width + words + ahead, hidden, 2, 3, gain=0.1)
 
-    def forward(self, features: torch.Tensor, words: torch.Tensor) -> SkillOutlook:
-        """From features [N, width] of observations, with what is remembered, and [N, words] of instructions."""
-        begins, done, log_steps = self.layers(torch.cat([features, words], 1)).unbind(1)
+    def forward(self, features: torch.Tensor, words: torch.Tensor, waypoints: torch.Tensor | None) -> SkillOutlook:
+        """From features [N, width] of observations, with what is remembered, [N, words] of instructions, and waypoints
+        [N, waypoints, D], for a policy that has some."""
+        seen = [features, words]
+        if waypoints is not None:
+            seen.append((waypoints - features[:, None, : self.numbers]).flatten(1))
+        begins, done, log_steps = self.layers(torch.cat(seen, 1)).unbind(1)
         return SkillOutlook(begins, done, log_steps.clamp(0, MOST_LOG_STEPS))

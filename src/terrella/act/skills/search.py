@@ -14,7 +14,7 @@ from ...core.similar import did_you_mean
 from ...core.world import Observation
 from ..sentences import words_of
 from .library import Skill, SkillLibrary
-from .phrases import ARTICLES, goal_of
+from .phrases import ARTICLES, PRONOUNS, completed, goal_of, things_of
 
 STEP_COST = 0.002  # of a step, in nats: of two orders that are as likely the shorter one
 LEAST_ENDS = 4  # ends of the same instruction from which these alone are what it brings about
@@ -61,10 +61,13 @@ class SkillSearch:
     _starts: dict[str, float] = field(default_factory=dict)
 
     def instructions_of(self, goal: str) -> Groups:
-        """The instructions that the phrases of a goal may stand for. PlanningError for unknown words, or what no skill does."""
-        words, groups = self.library.network.words, goal_of(goal)
+        """The instructions that the phrases of a goal may stand for; "it", and what a phrase leaves out, is a thing that an
+        earlier one names. PlanningError for unknown words, or what no skill does."""
+        words, groups = self.library.network.words, goal_of(goal, lambda phrase: bool(self._fits(phrase)))
         assert words is not None
-        unknown = [word for word in words.unknown(" ".join(itertools.chain(*groups))) if word not in ARTICLES]
+        unknown = [
+            word for word in words.unknown(" ".join(itertools.chain(*groups))) if word not in (*ARTICLES, *PRONOUNS)
+        ]
         if unknown:
             hint = did_you_mean(unknown[0], words.vocabulary) or "."
             names = ", ".join(f"'{word}'" for word in unknown)
@@ -73,17 +76,28 @@ class SkillSearch:
             )
         if not groups:
             raise PlanningError("say what to do, as in --goal 'go to the red ball, then pick up the blue key'.")
-        return tuple(tuple(self._instructions(phrase) for phrase in group) for group in groups)
+        things, read = list[str](), list[tuple[tuple[str, ...], ...]]()
+        for group in groups:
+            read.append(tuple(self._instructions(phrase, things) for phrase in group))
+            for texts in read[-1]:
+                things = [*things_of(texts[0]), *things]  # the last phrase first
+        return tuple(read)
 
-    def _instructions(self, phrase: str) -> tuple[str, ...]:
-        words = self.library.network.words
-        assert words is not None
-        spelled = [word if word in ARTICLES else words.spelled(word)[0] for word in words_of(phrase)]
-        fits = dict.fromkeys(text for skill in self.library.skills for text in skill.phrase.fillings(spelled))
+    def _instructions(self, phrase: str, things: Sequence[str]) -> tuple[str, ...]:
+        fits = self._fits(phrase)
+        if len(fits) != 1:
+            fits = next(filter(None, map(self._fits, completed(phrase, things))), fits)
         if not fits:
             names = "; ".join(skill.name for skill in self.library.skills)
             raise PlanningError(f"no skill does '{phrase}'. There are: {names}.")
-        return tuple(fits)
+        return fits
+
+    def _fits(self, phrase: str) -> tuple[str, ...]:
+        """The instructions that a phrase leaves open; () where no skill does it."""
+        words = self.library.network.words
+        assert words is not None
+        spelled = [word if word in ARTICLES else next(iter(words.spelled(word)), word) for word in words_of(phrase)]
+        return tuple(dict.fromkeys(text for skill in self.library.skills for text in skill.phrase.fillings(spelled)))
 
     def plan(self, groups: Groups, seen: Observation) -> SkillPlan:
         """The likeliest order and arguments of all phrases, from an observation [1, ...]. PlanningError where even that is less

@@ -13,15 +13,14 @@ from ...act.skills.predictor import SkillPredictor
 from ..learners import adamw, warmup_cosine
 from ..train_step import TrainStep
 from ..trainer import Loss
-from .imitation import window_features
 
 
 @dataclass(frozen=True)
 class SkillMoments:
     """N segments of T moments, and for each a moment on the way and the end of any segment."""
 
-    seen: Mapping[str, torch.Tensor]  # channel -> [M, ...], the moments of all segments
-    windows: torch.Tensor  # int64 [N, T]: the row of `seen` of each moment
+    features: torch.Tensor  # [N, T, width], what the policy sees at them
+    began: torch.Tensor  # [N, width], the same where the segments began
     other: Mapping[str, torch.Tensor]  # channel -> [N, ...], on the way
     other_ends: Mapping[str, torch.Tensor]  # channel -> [N, ...]
     others: torch.Tensor  # bool [N]: the other segment is of another instruction
@@ -41,19 +40,25 @@ class SkillPrediction:
     def losses(self, batch: SkillMoments, now: TrainStep) -> Iterator[Loss]:
         inside, count = batch.left >= 0, len(batch.left)
         with torch.no_grad():
-            spoken, features, recalled = recalled_moments(self.network, batch)
-            other, other_ends = (
-                self.network.recall(self.network.features(each, spoken)[:, None], None)[0][:, 0]
-                for each in (batch.other, batch.other_ends)
-            )
+            assert self.network.words is not None
+            moments, spoken = recalled_moments(self.network, batch), self.network.words(batch.words)
             on_way = (now.rand(count) * (inside.sum(1) - 1)).long()
-            here = self.network.recall(features[torch.arange(count), on_way][:, None], None)[0][:, 0]
-        outlook = self.predictor(recalled.flatten(0, 1), spoken.repeat_interleave(inside.shape[1], 0))
-        begins = self.predictor(torch.cat([here, other]), spoken.repeat(2, 1)).begins
+            begun = [batch.features[torch.arange(count), on_way]]
+            begun += [self.network.features(each, spoken) for each in (batch.other, batch.other_ends)]
+            here, other, other_ends = (
+                (
+                    self.network.recall(each[:, None], None)[0][:, 0],
+                    spoken,
+                    self.network.foreseen(each[:, None], spoken),
+                )
+                for each in begun
+            )
+        outlook = self.predictor(*moments)
+        begins = torch.cat([self.predictor(*each).begins for each in (here, other)])
         mine = torch.cat([torch.ones(count), torch.zeros(count)]).to(begins)
         over = ((batch.left == 0) & batch.success[:, None]).float().flatten()
         done = F.binary_cross_entropy_with_logits(outlook.done, over, inside.float().flatten(), reduction="sum")
-        not_yet = F.softplus(self.predictor(other_ends, spoken).done) * batch.others
+        not_yet = F.softplus(self.predictor(*other_ends).done) * batch.others
         won = (inside & batch.success[:, None]).flatten()
         error = (outlook.log_steps - batch.left.clamp_min(0).log1p().flatten()).square()
         parts = {
@@ -64,9 +69,16 @@ class SkillPrediction:
         yield Loss(self.name, torch.stack(list(parts.values())).sum(), parts)
 
 
-def recalled_moments(network: ImitationNetwork, batch: SkillMoments) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The features of the instructions [N, words], those of all moments [N, T, width], and these with what is remembered."""
+def recalled_moments(
+    network: ImitationNetwork, batch: SkillMoments
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """What a predictor is given of all moments: their features [N * T, width] with what is remembered, the features of their
+    instructions, and the waypoints that were expected where these began."""
     assert network.words is not None
-    spoken = network.words(batch.words)
-    features = window_features(network, batch.seen, spoken, batch.windows)
-    return spoken, features, network.recall(features, None)[0]
+    spoken, length = network.words(batch.words), batch.features.shape[1]
+    waypoints = network.foreseen(batch.began[:, None], spoken)
+    return (
+        network.recall(batch.features, None)[0].flatten(0, 1),
+        spoken.repeat_interleave(length, 0),
+        None if waypoints is None else waypoints.repeat_interleave(length, 0),
+    )

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ...act.imitation import load_imitation_network
+from ...act.imitation_network import ImitationNetwork
 from ...act.sentences import words_of
 from ...act.skills.library import Skill, SkillLibrary
 from ...act.skills.phrases import Phrase, phrases_of
@@ -24,6 +25,7 @@ from ..recording import Recording
 from ..trainer import Report, Run, Trainer
 
 STAGE = "skills"
+AT_ONCE = 256  # moments of which features are computed
 MOST_ENDS = 256  # ends that a library keeps of a skill
 MOST_MOMENTS = 64  # of a segment: the last ones
 TESTED = 2048  # segments on which the end is tested
@@ -68,11 +70,40 @@ class Segments:
 
 
 @dataclass(frozen=True)
+class SegmentFeatures:
+    """What the policy sees at the moments of segments, each under the segment's instruction."""
+
+    rows: torch.Tensor  # [moments of all segments, width]
+    offset: np.ndarray  # [S]: where each segment's first moment is
+
+    @staticmethod
+    @torch.no_grad()
+    def of(network: ImitationNetwork, rows: DemonstrationRows, segments: Segments, report: Report) -> SegmentFeatures:
+        assert network.words is not None
+        lengths = segments.end - segments.first + 1
+        offset = np.cumsum(lengths) - lengths
+        of_segment = np.repeat(np.arange(len(lengths)), lengths)
+        moments = segments.first[of_segment] + np.arange(len(of_segment)) - offset[of_segment]
+        spoken = network.words(network.words.read(rows.recording.cache.tasks))
+        parts = []
+        for part in np.array_split(np.arange(len(moments)), -(-len(moments) // AT_ONCE)):
+            words = spoken[torch.from_numpy(segments.task[of_segment[part]])]
+            parts.append(network.features(rows.observations(moments[part]), words).cpu())
+            report(int(part[-1]) + 1, len(moments), "features")
+        return SegmentFeatures(torch.cat(parts), offset - segments.first)
+
+    def at(self, segments: np.ndarray, moments: np.ndarray) -> torch.Tensor:
+        """[..., width] of rows [...] within segments [...]."""
+        return self.rows[torch.from_numpy(self.offset[segments] + moments)]
+
+
+@dataclass(frozen=True)
 class SkillRows:
     """Moments of segments, drawn for training or for a test."""
 
     rows: DemonstrationRows
     segments: Segments
+    features: SegmentFeatures
     texts: torch.Tensor  # int64 [tasks, WORDS]
     picked: np.ndarray  # the segments to draw from
 
@@ -86,14 +117,11 @@ class SkillRows:
         first = np.maximum(s.first[mine], s.end[mine] - MOST_MOMENTS + 1)
         moments, device = np.arange(int((s.end[mine] - first).max()) + 1), self.rows.device
         left = (s.end[mine] - first)[:, None] - moments
-        inside = left >= 0
-        before = np.cumsum(inside.sum(1)) - inside.sum(1)
-        seen = self.rows.observations((first[:, None] + moments)[inside])
-        windows = before[:, None] + np.minimum(moments, inside.sum(1)[:, None] - 1)
+        shown = np.minimum(first[:, None] + moments, s.end[mine][:, None])
         at = s.first[other] + (rng.random(len(mine)) * (s.end - s.first)[other]).astype(np.int64)
         return SkillMoments(
-            seen,
-            torch.from_numpy(windows).to(device),
+            self.features.at(mine[:, None], shown).to(device),
+            self.features.at(mine, s.first[mine]).to(device),
             self.rows.observations(at),
             self.rows.observations(s.end[other]),
             torch.from_numpy(s.task[mine] != s.task[other]).to(device),
@@ -120,10 +148,11 @@ def learn_skills(
     run = Run.of(Path(out) / "training", config, report, recording=recording.name, policy=str(policy))
     run.saved_facts(STAGE)
     torch.manual_seed(config.seed)
-    predictor = SkillPredictor(network.recalled_width, network.words.width)
+    predictor = SkillPredictor(network)
     rows = DemonstrationRows.of(recording, network.config, torch.device("cpu"))
     picks = [np.flatnonzero(segments.held_out == held) for held in (False, True)]
-    train, test = (SkillRows(rows, segments, network.words.read(tasks), pick) for pick in picks)
+    features = SegmentFeatures.of(network, rows, segments, report)
+    train, test = (SkillRows(rows, segments, features, network.words.read(tasks), pick) for pick in picks)
     feed = RandomBatches(lambda now: train.sample(config.batch, now.rng))
     trainer = Trainer(run, STAGE, feed, SkillPrediction(network, predictor, config.learning_rate), config.steps)
     trainer.train(lambda: None)
@@ -180,9 +209,7 @@ class EndTest:
         won, parts = rng.permutation(won)[:TESTED], []
         for part in np.array_split(won, -(-len(won) // 64)):
             batch = test.at(part, rng)
-            spoken, _, recalled = recalled_moments(library.network, batch)
-            every = spoken.repeat_interleave(recalled.shape[1], 0)
-            done = library.predictor(recalled.flatten(0, 1), every).done.view(batch.left.shape)
+            done = library.predictor(*recalled_moments(library.network, batch)).done.view(batch.left.shape)
             end = (batch.left == 0).float().argmax(1)
             highest = done.masked_fill(batch.left <= 0, -torch.inf).amax(1)
             parts.append(torch.stack([done[torch.arange(len(part)), end], highest]).cpu())
