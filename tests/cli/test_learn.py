@@ -23,7 +23,7 @@ from terrella.learn.recipes.video import TrainConfig, TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
 from terrella.workflows.learn import LearnConfig, held_to_real_time
-from terrella.workflows.learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from terrella.workflows.learn_schedule import DISTILLING, RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from terrella.workflows.learn_trial import Pace, forecast, slower, time_environment
 from terrella.workflows.opening import EnvironmentConfig
 from terrella.workflows.results import changed_settings
@@ -56,6 +56,35 @@ def test_the_minutes_are_divided_and_none_is_left_over(minutes, tmp_path):
     plan.spent[TRAINING] = plan.seconds  # later than was planned
     plan.note(TRAINING, {})
     assert 0 <= plan.left_s(SCORING) <= share[SCORING], "nothing is promised beyond the minutes"
+
+
+def test_a_student_has_a_part_of_the_time_of_training(tmp_path):
+    plan, alone = LearnSchedule(tmp_path / "a", {}, 10, student=True), LearnSchedule(tmp_path / "b", {}, 10).share_s
+    share = plan.share_s
+    assert share[TRAINING] + share[DISTILLING] == alone[TRAINING] and share[DISTILLING] == 0.3 * alone[TRAINING]
+    assert alone[DISTILLING] == 0
+    plan = begun(tmp_path / "c", {}, 3)
+    for stage in (RECORDING, TRAINING, DISTILLING, SCORING):
+        plan.note(stage, {})
+    (tmp_path / "c" / "student").mkdir()
+    assert DISTILLING not in LearnSchedule(tmp_path / "c", {}, 5).facts, "its teacher learns on"
+    assert not (tmp_path / "c" / "student").exists()
+
+
+@pytest.mark.slow
+def test_a_student_is_learned_and_scored_beside_its_world(tmp_path, capsys, monkeypatch):
+    shares = {RECORDING: 60.0, TRAINING: 30.0, DISTILLING: 30.0, SCORING: 60.0}
+    monkeypatch.setattr(LearnSchedule, "share_s", property(lambda schedule: shares))
+    monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 8)
+    monkeypatch.setattr("terrella.workflows.learn.CLIP_COUNTS", (3,))
+    monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: None)
+    asked = [*command(tmp_path / "two"), "--student"]
+    assert main([*asked, "--preset", "medium", "--batch", "1", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    student, teacher = terrella.load(told["student"]), terrella.load(told["world"])
+    assert (student.generator.config.channels, teacher.generator.config.channels) == ((64, 112, 160), (144, 256, 352))
+    assert any(line.startswith("two-student is ") for line in told["verdict"])
+    assert "two-student" in Path(told["card"]).read_text()
 
 
 def test_a_plan_goes_on_with_its_own_settings_alone(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from terrella.core.errors import TrainingError
 from terrella.data import Recorder
 from terrella.learn.moves import Scrolling, stitch_episodes
 from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
+from terrella.learn.recipes.student import student_settings, train_student
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import Recording
 from terrella.learn.train_step import TrainStep
@@ -145,6 +147,39 @@ def test_a_stopped_run_goes_on_exactly(flow_run, scrolling, tmp_path):
 def test_what_no_flow_network_can_be_made_of_is_refused(scrolling, tmp_path, given, why):
     with pytest.raises(TrainingError, match=why):
         train_video(scrolling, tmp_path, replace(FLAT, **given), quiet)
+
+
+def losses_of(teaching: float, taught: bool) -> dict[str, float]:
+    """Of a network beside another of the same weights, or none."""
+    torch.manual_seed(0)
+    network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
+    torch.nn.init.normal_(network.output.weight, std=0.1)
+    objective = FlowFrames(network, 5e-3, 1, 4.0, copy.deepcopy(network).eval() if taught else None, teaching)
+    frames = torch.randint(0, 256, (4, 3, 3, 16, 16), dtype=torch.uint8, generator=make_rng(0))
+    (loss,) = objective.losses(FlowClips(frames, torch.zeros(4, 3, 1), None), step(0.9))
+    return {name: float(part.detach()) for name, part in loss.parts.items()}
+
+
+def test_a_teacher_is_as_much_of_the_target_as_is_said():
+    assert max(losses_of(1.0, True).values()) < 1e-6, "the student draws as the teacher"
+    alone, half = losses_of(0.0, False), losses_of(0.5, True)
+    assert losses_of(0.0, True) == alone
+    assert all(0.2 * alone[name] < half[name] < 0.6 * alone[name] for name in alone)
+
+
+def test_a_student_is_a_smaller_world_of_the_same_game(scrolling, tmp_path):
+    train_video(scrolling, tmp_path / "teacher", replace(FLAT, channels=(16, 8, 8), steps=8), quiet)
+    teacher = load_world(tmp_path / "teacher" / "world")
+    settings = replace(student_settings(teacher), channels=(8, 8, 8), steps=16, batch=2)
+    train = lambda out: train_student(teacher, scrolling, out, settings, quiet)  # noqa: E731
+    facts = train(tmp_path / "student")
+    student = load_world(facts["world"])
+    assert student.generator.config.channels == (8, 8, 8) and student.spec.action_names == teacher.spec.action_names
+    assert facts["gflop_per_frame"]["student"] < facts["gflop_per_frame"]["teacher"] and facts["step"] == 16
+    ours, theirs = (one.generator.scrolling.state_dict() for one in (student, teacher))
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs), "it scrolls as the teacher does"
+    assert "batches" in check_world(student)
+    resumes_exactly(train, tmp_path / "student", tmp_path / "cut", {"flow": 0})
 
 
 def test_its_drawing_steps_can_be_chosen(scrolling, tmp_path):

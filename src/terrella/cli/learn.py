@@ -33,9 +33,9 @@ def learn(
     if config.controls != ControlsConfig():
         raise TerrellaError("--keys, --action-names and --idle are for a person who plays; --practise takes none.")
     plain = LearnConfig()
-    if any(getattr(config, name) != getattr(plain, name) for name in ("preset", "batch", "compile", "half")):
+    if any(getattr(config, name) != getattr(plain, name) for name in ("preset", "student", "batch", "compile", "half")):
         raise TerrellaError(
-            "--preset, --batch, --no-compile and --no-half are for worlds of pictures; --practise takes none."
+            "--preset, --student, --batch, --no-compile and --no-half are for worlds of pictures; --practise takes none."
         )
     shared = (config.minutes, config.out, config.frames, config.seed, config.environment, config.device)
     rounds = policy_workflow.PractiseConfig(*shared)

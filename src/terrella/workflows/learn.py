@@ -7,24 +7,29 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from .. import library
 from ..act.policies_by_name import policy_of
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
 from ..data import Dataset, RecordOptions
 from ..data.recording import LONGEST
-from ..learn.devices import describe_device, one_thread, yield_cores
-from ..learn.presets import PresetName
+from ..learn.devices import describe_device, free_bytes, one_thread, yield_cores
+from ..learn.presets import PRESETS, PresetName, TrainingPlan
+from ..learn.recipes.student import student_settings, train_student
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST, learned_size
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
+from ..worlds.folder import load_world
 from .collect import explore, storage_of
-from .learn_schedule import RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
+from .learn_schedule import DISTILLING, RECORDING, SCORING, STUDENTS_SHARE, TRAINING, LearnSchedule, folder_for
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
-from .opening import ControlsConfig, Device, EnvironmentConfig, device_of
+from .opening import ControlsConfig, Device, EnvironmentConfig, device_of, load_named
 from .progress import Progress, Report, duration, silent, stage, stopping_with
 from .recording_facts import describe, recording_facts
 from .results import changed_settings, command, jsonable
-from .score import QUICK_HORIZONS, ExamRequest, arms_of, exam_of, write_card
+from .score import QUICK_HORIZONS, ExamRequest, arms_of, digest_of, exam_of, write_card
 
 ENDLESS = 10**9  # steps: training ends with its time
 EPISODES = 12  # recorded at least, shorter ones if need be: scoring needs some that training did not see
@@ -40,8 +45,14 @@ REAL_TIME_FPS, HELD_FPS = (
     25,
 )  # steps per second that a learned world plays on two cores; faster games are held to 25
 STRIPS = 20  # pictures of truth and prediction in a training, at most
-_DOES = {RECORDING: "records for up to", TRAINING: "trains for", SCORING: "scores for"}
-_DID = {RECORDING: "recorded for", TRAINING: "trained for", SCORING: "scored for"}
+STUDENT = "student"  # a folder, and the arm of its score
+_DOES = {
+    RECORDING: "records for up to",
+    TRAINING: "trains for",
+    DISTILLING: "trains a student for",
+    SCORING: "scores for",
+}
+_DID = {RECORDING: "recorded for", TRAINING: "trained for", DISTILLING: "trained a student for", SCORING: "scored for"}
 
 
 @dataclass(frozen=True)
@@ -60,6 +71,9 @@ class LearnConfig:
     # Size of the network of a world without depth: small, medium, large or huge (see `train video`). Default: by device and
     # minutes.
     preset: PresetName = "auto"
+    # Also distil the world into a student of the preset small, which CPUs play: 0.8 GFLOP a frame of 64 x 64 pixels, three
+    # tenths of the time of training.
+    student: bool = False
     batch: int | None = None  # Frames per training step. Default: 8 on a CPU, 64 on a GPU.
     compile: bool = True  # --no-compile: on a GPU, train the network as it is.
     half: bool = True  # --no-half: train in float32 where the device computes bfloat16.
@@ -78,6 +92,7 @@ class LearnResult:
 
     again: str  # The command that trains it further.
     steps: int  # Training steps so far.
+    student: Path | None = None  # Folder of the student, if one was distilled.
 
     @property
     def play(self) -> str:
@@ -87,14 +102,18 @@ class LearnResult:
         facts: dict[str, Any] = {"verdict": self.verdict} | ({"card": self.card} if self.card else {})
         minutes = {f"{name}_minutes": round(seconds / 60, 2) for name, seconds in self.spent_s.items()}
         following = {"play": self.play, "train_further": self.again}
+        facts |= {STUDENT: self.student} if self.student else {}
         return jsonable({**facts, "world": self.world, "steps": self.steps, **following, **minutes})
 
     def summary(self) -> str:
-        stages = ", ".join(f"{text} {duration(self.spent_s[name])}" for name, text in _DID.items())
+        stages = ", ".join(
+            f"{text} {duration(self.spent_s[name])}" for name, text in _DID.items() if self.spent_s[name]
+        )
         lines = [*self.verdict, f"It took {duration(sum(self.spent_s.values()))}: {stages}."]
         lines += [f"the card: {self.card}"] if self.card else []
         few = f"{self.steps} training steps are too few to play it yet." if self.steps < HOPELESS_STEPS else ""
         lines.append(few or f"play it: {self.play}")
+        lines += [f"play its student: {command('terrella', 'play', self.student)}"] if self.student else []
         return "\n".join([*lines, f"train it further: {self.again}"])
 
 
@@ -109,9 +128,14 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     settings = {"environment": environment, "frames": config.frames, "seed": config.seed}
     settings |= asdict(config.environment) | asdict(config.controls)
     settings |= {"policy": config.policy} if config.policy else {}
-    schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes)
+    schedule = LearnSchedule(Path(config.out or folder_for(environment)), settings, config.minutes, config.student)
     if SCORING in schedule.facts:
         progress(f"{schedule.folder} is finished; --minutes with more than {schedule.minutes:g} trains it further.")
+        if config.student and DISTILLING not in schedule.facts:
+            run, data, out = (schedule.folder / part for part in ("run", RECORDING, STUDENT))
+            progress(
+                f"It has no student; this distils one: {command('terrella', 'train', 'distil', run, data=data, out=out)}"
+            )
     else:
         _Learning(environment, config, schedule, progress).run()
     score = schedule.facts[SCORING]
@@ -120,7 +144,10 @@ def learn(environment: str, config: LearnConfig = LearnConfig(), *, progress: Pr
     lacking = max(0, FEW_STEPS - steps) * schedule.spent[TRAINING] / max(steps, 1) / 60
     longer = {**changed_settings(config), "minutes": math.ceil(max(2 * schedule.minutes, schedule.minutes + lacking))}
     again = command("terrella", "learn", environment, **longer)
-    return LearnResult(tuple(score["verdict"]), schedule.folder / "run", card, dict(schedule.spent), again, steps)
+    student = schedule.folder / STUDENT if DISTILLING in schedule.facts else None
+    return LearnResult(
+        tuple(score["verdict"]), schedule.folder / "run", card, dict(schedule.spent), again, steps, student
+    )
 
 
 def check_budget(minutes: float, frames: int) -> None:
@@ -148,9 +175,29 @@ class _Learning:
         if RECORDING in schedule.facts:
             self._announce()
         with stage(f"learning {schedule.folder.name}", progress) as shown:
-            for name, work in ((RECORDING, self._record), (TRAINING, self._train), (SCORING, self._score)):
-                if name not in schedule.facts:
+            self._check_student()
+            works = {RECORDING: self._record, TRAINING: self._train, DISTILLING: self._distil, SCORING: self._score}
+            for name, work in works.items():
+                if name not in schedule.facts and (name != DISTILLING or schedule.student):
                     self._do(name, work, shown)
+                if name == RECORDING:
+                    self._check_student()
+
+    def _check_student(self) -> None:
+        """Says so where the world will be no larger than a student, so that none is distilled."""
+        schedule, device = self.schedule, torch.device(device_of(self.config.device))
+        if not schedule.student or DISTILLING in schedule.facts:
+            return
+        plan = TrainingPlan.of(self.config.preset, device, schedule.share_s[TRAINING] / 60, free_bytes(device))
+        dataset = Dataset(schedule.folder / RECORDING) if RECORDING in schedule.facts else None
+        if plan.preset is PRESETS[0]:
+            why = "the world itself is of the preset small (--preset medium or larger has one)"
+        elif dataset is not None and dataset.has("depth") and dataset.has("pose"):
+            why = "worlds with depth and poses are small themselves"
+        else:
+            return
+        schedule.student = False
+        self.progress(f"No student is distilled: {why}.")
 
     def _do(self, name: str, work: Callable[[Report], dict[str, object]], shown: Report) -> None:
         """One stage. All share one bar, that of the minutes."""
@@ -169,7 +216,10 @@ class _Learning:
     def _announce(self) -> None:
         """One line about the stages to come, with their times."""
         schedule = self.schedule
-        parts = [f"{text} {duration(schedule.left_s(at))}" for at, text in _DOES.items() if at not in schedule.facts]
+        left = {at: schedule.left_s(at) for at in _DOES if at not in schedule.facts}
+        parts = [
+            f"{_DOES[at]} {duration(seconds)}" for at, seconds in left.items() if at != DISTILLING or schedule.student
+        ]
         device = describe_device(device_of(self.config.device))
         self.progress(
             f"Of {duration(schedule.seconds)} on {device} it {', '.join(parts)}; all files are in {schedule.folder}."
@@ -195,6 +245,7 @@ class _Learning:
         frames = min(self.config.frames, int(recorded_s * pace.frames_per_s))
         recorded_s = frames / pace.frames_per_s
         training_s = schedule.seconds - schedule.spent[RECORDING] - recorded_s - schedule.share_s[SCORING]
+        training_s *= 1 - STUDENTS_SHARE * schedule.student
         self.progress(forecast(pace, schedule.minutes, frames, training_s))
 
     def _record(self, report: Report) -> dict[str, object]:
@@ -258,6 +309,16 @@ class _Learning:
         times = {"hours": hours, "save_every_s": SAVE_EVERY_S, "strip_every_s": self._strip_s}
         return TrainConfig(self.schedule.folder.name, steps=ENDLESS, **times, **chosen)
 
+    def _distil(self, report: Report) -> dict[str, object]:
+        schedule, training = self.schedule, self._training
+        teacher = load_world(library.folder_of(schedule.folder / "run"), device=str(device_of(self.config.device)))
+        same = ("steps", "seed", "device", "batch", "compile", "half", "save_every_s", "strip_every_s")
+        settings = replace(student_settings(teacher), **{name: getattr(training, name) for name in same})
+        settings = replace(settings, hours=schedule.share_s[DISTILLING] / 3600)
+        data, out = schedule.folder / RECORDING, schedule.folder / STUDENT
+        facts = train_student(teacher, data, out, settings, report, say=self.progress)
+        return {"world": facts["world"], "steps": facts["step"], "gflop_per_frame": facts["gflop_per_frame"]}
+
     def _paced(self, steps: int) -> None:
         if line := slower(steps, self.schedule.minutes):
             self.progress(line)
@@ -266,6 +327,9 @@ class _Learning:
         schedule = self.schedule
         run, data = str(schedule.folder / "run"), schedule.folder / RECORDING
         arms, closing = arms_of(run, self.config.device, fast=False, quick=True, progress=self.progress)
+        student = str(schedule.folder / STUDENT) if DISTILLING in schedule.facts else ""
+        if student:
+            arms |= {STUDENT: load_named(student, self.config.device, progress=self.progress)}
         try:
             exam, identity = _longest_exam(
                 ExamRequest(arms, closing, data, clips=max(CLIP_COUNTS), drift=0, seed=self.config.seed), report
@@ -279,8 +343,12 @@ class _Learning:
             later = command("terrella", "score", run, data=data, quick=True)
             return {"verdict": [f"{schedule.folder.name} is not scored: too little time was left. Score it: {later}"]}
         exam = exam.of(schedule.facts["clips"])
+        identity += digest_of(student) if student else ""
         card, files = write_card(run, exam, identity, schedule.folder / "score", report)
-        return {"verdict": verdict(card), "card": str(files[1])}
+        lines = verdict(card)
+        if student:
+            lines += verdict(replace(card, worlds={STUDENT: card.worlds[STUDENT]}))[:2]
+        return {"verdict": lines, "card": str(files[1])}
 
 
 def held_to_real_time(name: str, environment: EnvironmentConfig) -> str:

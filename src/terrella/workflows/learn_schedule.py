@@ -14,7 +14,8 @@ from ..core.errors import TerrellaError
 from ..core.files import write_json
 from .progress import Report
 
-RECORDING, TRAINING, SCORING = "recording", "training", "scoring"
+RECORDING, TRAINING, DISTILLING, SCORING = "recording", "training", "distilling", "scoring"
+STUDENTS_SHARE = 0.3  # of the time of training
 STARTING_S = 5.0  # of each stage, for imports and for reading again
 SAVE_EVERY_S = 5.0
 PAGE = "live.html"
@@ -48,17 +49,18 @@ def refuse_foreign_folder(folder: Path) -> None:
 
 
 class LearnSchedule:
-    """The stages of a folder with `recording`, `run` and `score`; the file learn.json keeps the settings and what is done.
+    """The stages of a folder with `recording`, `run`, `student` and `score`; learn.json keeps the settings and what is done.
 
     settings: JSON values, which must not change once something is recorded.
     minutes:  for all stages and all runs of the command together; the most that any run was given.
+    student:  whether a student is distilled of the world.
     facts:    what is known of the stages that are over, by their names.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], minutes: float):
+    def __init__(self, folder: Path, settings: Mapping[str, Any], minutes: float, student: bool = False):
         self.folder, self.settings, self.seconds = folder, json.loads(json.dumps(settings)), 60 * minutes
-        self.minutes = minutes
-        self.spent: dict[str, float] = dict.fromkeys((RECORDING, TRAINING, SCORING), 0.0)
+        self.minutes, self.student = minutes, student
+        self.spent: dict[str, float] = dict.fromkeys((RECORDING, TRAINING, DISTILLING, SCORING), 0.0)
         self.facts: dict[str, Any] = {}
         self._file, self._began = folder / "learn.json", time.monotonic()
         if self._file.exists():
@@ -83,8 +85,9 @@ class LearnSchedule:
         scoring = min(max(60.0, self.seconds / 15), 600.0, self.seconds / 8)
         recording = self.seconds / 8 + self.facts.get("trial_s", 0.0)
         recording = self.spent[RECORDING] if RECORDING in self.facts else recording
-        training = self.seconds - recording - scoring - STARTING_S
-        return {RECORDING: recording, TRAINING: max(training, 1.0), SCORING: scoring}
+        training = max(self.seconds - recording - scoring - STARTING_S, 1.0)
+        students = STUDENTS_SHARE * training if self.student else 0.0
+        return {RECORDING: recording, TRAINING: training - students, DISTILLING: students, SCORING: scoring}
 
     def live_page(self) -> str:
         """The address of a page of the newest picture of truth and prediction, which is written."""
@@ -146,8 +149,9 @@ class LearnSchedule:
         try:
             kept = json.loads(self._file.read_text(encoding="utf-8"))
             settings, minutes = dict(kept["asked"]), float(kept["minutes"])
-            spent, facts = {name: float(kept["spent_s"][name]) for name in self.spent}, dict(kept["facts"])
-        except (ValueError, KeyError, TypeError) as error:
+            spent = self.spent | {name: float(seconds) for name, seconds in kept["spent_s"].items()}
+            facts = dict(kept["facts"])
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise TerrellaError(f"{self._file} is damaged ({error}); give another --out.") from error
         if not self.has_recording:
             return self.forget()
@@ -155,4 +159,5 @@ class LearnSchedule:
         self.spent, self.facts, self.minutes = spent, facts, max(self.minutes, minutes)
         if self.seconds > 60 * minutes and TRAINING in facts:  # more time for a finished world: train it on
             self.facts = {name: fact for name, fact in facts.items() if name == RECORDING}
-            self.spent[SCORING] = 0.0
+            self.spent |= {DISTILLING: 0.0, SCORING: 0.0}
+            shutil.rmtree(self.folder / "student", ignore_errors=True)  # of a teacher that learns on

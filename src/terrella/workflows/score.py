@@ -125,7 +125,7 @@ def score(world: str | Path, config: ScoreConfig, *, progress: Progress = silent
 def write_card(name: str, exam: Exam, identity: str, out: Path, report: Report) -> tuple[Scorecard, list[Path]]:
     """The scorecard of the world `name`, and its files in the folder `out`, where figures are kept as they come."""
     card = examine(
-        exam, out / "parts", identity + _digest(name), lambda share, text, left_s: report(share, 1, text, left_s)
+        exam, out / "parts", identity + digest_of(name), lambda share, text, left_s: report(share, 1, text, left_s)
     )
     files = write_report(card, out, f"{next(iter(card.worlds.values()))}: the scorecard")
     shutil.rmtree(out / "parts", ignore_errors=True)
@@ -227,7 +227,7 @@ def open_cache(data: Path, world: World, progress: Progress, report: Report | No
     return caches[0]
 
 
-def _digest(name: str) -> str:
+def digest_of(name: str) -> str:
     """A digest of a learned world's files: other weights are another world."""
     try:
         folder = library.folder_of(name)

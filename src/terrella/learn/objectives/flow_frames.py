@@ -10,7 +10,7 @@ import torch
 
 from ...space.matching import scroll_index
 from ...worlds.controls import Controls
-from ...worlds.flow import FlowNetwork, carry
+from ...worlds.flow import FlowFeatures, FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..devices import Captured, Compiled
 from ..learners import Ema, warmup_cosine
@@ -95,10 +95,21 @@ def memory_shown(place: torch.Tensor, rows: torch.Tensor, over: torch.Tensor, ki
 
 class FlowFrames:
     """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise, and later also at a
-    random t. Pictures are carried along by the true scroll. stress: the additional weight of pixels that change otherwise."""
+    random t. Pictures are carried along by the true scroll. stress: the additional weight of pixels that change otherwise.
+    teacher: a trained network, whose predictions from the same inputs are learned as well, with the weight `teaching` of 0 to 1
+    against the recorded frames."""
 
-    def __init__(self, network: FlowNetwork, learning_rate: float, rollout: int, stress: float):
+    def __init__(
+        self,
+        network: FlowNetwork,
+        learning_rate: float,
+        rollout: int,
+        stress: float,
+        teacher: FlowNetwork | None = None,
+        teaching: float = 0.0,
+    ):
         self.stress, self.losses_per_batch = stress, rollout  # gradient steps per batch
+        self.teaching, self._teacher = teaching, None if teacher is None else (teacher.encode, teacher.clean)
         self.generator = channels_last(network)
         self._encode, self._clean = self.generator.encode, self.generator.clean
         self.smooth = Ema(self.generator, 0.995)
@@ -110,6 +121,8 @@ class FlowFrames:
     def compile(self) -> None:
         """Has both halves of the network compiled at their first call, and drawing captured as a CUDA graph."""
         self._encode, self._clean = Compiled(self.generator.encode), Compiled(self.generator.clean)
+        if self._teacher is not None:
+            self._teacher = Compiled(self._teacher[0]), Compiled(self._teacher[1])
         self._sample = Captured(self.smooth.module.sample)
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
@@ -142,7 +155,9 @@ class FlowFrames:
         with now.half():
             seen = self._encode(frames, context, scroll, memory)
             draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device))
-        parts = {"draft": self._error(draft, clean, base, changes)}
+        taught = self._taught(frames, context, scroll, memory, now)
+        target = self._target(clean, taught, None, torch.zeros(batch, device=now.device), now)
+        parts = {"draft": self._error(draft, target, base, changes)}
         if now.share < DRAFTS:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
@@ -150,8 +165,25 @@ class FlowFrames:
         noisy = (1 - share) * now.randn(*clean.shape) + share * clean
         with now.half():
             drawn = self._clean(seen, noisy, t)
-        parts["drawn"] = self._error(drawn, clean, base, changes)
+        parts["drawn"] = self._error(drawn, self._target(clean, taught, noisy, t, now), base, changes)
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
+
+    @torch.no_grad()
+    def _taught(self, frames, context, scroll, memory, now: TrainStep) -> FlowFeatures | None:
+        """What the teacher sees; None without one."""
+        if self._teacher is None:
+            return None
+        with now.half():
+            return self._teacher[0](frames, context, scroll, memory)
+
+    @torch.no_grad()
+    def _target(self, clean, taught: FlowFeatures | None, noisy, t, now: TrainStep) -> torch.Tensor:
+        """The recorded frames `clean`, moved towards what the teacher makes of `noisy` at t (None: its draft)."""
+        if self._teacher is None or taught is None:
+            return clean
+        with now.half():
+            wanted = self._teacher[1](taught, taught.base if noisy is None else noisy, t)
+        return torch.lerp(clean, wanted.float(), self.teaching)
 
     def _error(self, drawn, clean, base, changes) -> torch.Tensor:
         """The mean of absolute and squared errors [B, 3, H, W]. Pixels that change, in the recording (bool [B, 1, H, W]) or in what

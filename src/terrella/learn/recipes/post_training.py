@@ -1,8 +1,9 @@
 """train distil and train dreams: further training of a finished world, by a teacher or on its own rollouts."""
 
 import copy
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,22 @@ from ..learners import hold_then_decay
 from ..objectives.distillation import Student
 from ..objectives.dreams import DreamRollouts, DreamsObjective, dream_starts
 from ..paired import Paired, fingerprint, open_paired
+from ..presets import PresetName
 from ..recording import Box
 from ..sized_feed import SizedFeed
 from ..strips import draw_strip
 from ..trainer import Report, Run, Trainer
+from .student import student_settings, train_student
 
 
 @dataclass(frozen=True)
 class PostTraining:
     """Settings that both trainings share."""
 
-    batch: int = 16  # Batch size: frames (distil) or rollouts (dreams) per step.
-    learning_rate: float = 3e-4  # Peak learning rate of the generator.
+    # Batch size: frames (distil) or rollouts (dreams) per step. Default: 16, and of a world without depth as in `train video`.
+    batch: int | None = None
+    # Peak learning rate of the generator. Default: 3e-4, and without depth 6e-3.
+    learning_rate: float | None = None
     teacher_weight: float = 1.0  # Weight of the teacher's distribution, if there is a teacher.
     # A box x0 y0 x1 y1 of the map in metres that training never sees. Default: the one that was kept out of the world's training.
     keep_out: Box | None = None
@@ -40,11 +45,16 @@ class PostTraining:
 class DistilConfig(PostTraining):
     """Settings of a distillation."""
 
-    flow_steps: int = 1  # Flow steps in which the student draws a frame.
-    steps: int = 2000  # Training steps.
+    flow_steps: int | None = (
+        None  # Flow steps in which the student draws a frame. Default: 1, and without depth the teacher's.
+    )
+    # Training steps. Default: 2000, and without depth as in `train video`.
+    steps: int | None = None
+    hours: float | None = None  # Hours of training, earlier runs included.
+    preset: PresetName = "small"  # Size of the student of a world without depth.
     # Weight of the recorded frames. Trained on these alone, the student averages over uncertain content and blurs.
     truth_weight: float = 0.25
-    critic_weight: float = 0.2  # Weight of a patch critic.
+    critic_weight: float = 0.2  # Weight of a patch critic (worlds with depth).
 
 
 @dataclass(frozen=True)
@@ -60,27 +70,46 @@ class DreamsConfig(PostTraining):
 
 def distil(teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report) -> dict:
     """Trains, or resumes, the student in the folder `out`; its world is in `out`/world. Returns the facts of the run."""
-    name, steps = check_posed(teacher).spec.name, teacher.config.steps
+    if not teacher.config.geometry:
+        return _distil_frames(teacher, data, out, config, report)
+    name, steps, flow_steps = teacher.spec.name, teacher.config.steps, config.flow_steps or 1
+    updates = 2000 if config.steps is None else config.steps
     if steps == 1:
         raise TrainingError(
             f"{name} draws a frame in one step already; a teacher comes from `terrella train video --flow-steps 8`."
         )
-    if not 1 <= config.flow_steps < steps:
+    if not 1 <= flow_steps < steps:
         raise TrainingError(f"--flow-steps is 1 to {steps - 1}: {name} takes {steps}.")
-    if config.steps < 1 or config.batch < 1:
+    if updates < 1 or _batch(config) < 1:
         raise TrainingError("--steps and --batch are 1 or more.")
     pair = open_paired(teacher, data, config.keep_out, report)
     torch.manual_seed(config.seed)
     weights, rate = (
         (config.truth_weight, config.teacher_weight, config.critic_weight),
-        hold_then_decay(config.learning_rate, 50),
+        hold_then_decay(_rate(config), 50),
     )
-    student = Student("student", teacher.generator, config.flow_steps, rate, 0.0, weights, teacher.generator)
-    run = _run(pair, out, config, report)
-    feed = SizedFeed(lambda size: pair.feed(size, student.dream), config.batch)
-    trainer = Trainer(run, "distil", feed, student, config.steps)
-    about = f"{steps} to {config.flow_steps} steps a frame, {{}} updates"
+    student = Student("student", teacher.generator, flow_steps, rate, 0.0, weights, teacher.generator)
+    whole = replace(
+        config, flow_steps=flow_steps, steps=updates, hours=math.inf if config.hours is None else config.hours
+    )
+    run = _run(pair, out, whole, report)
+    feed = SizedFeed(lambda size: pair.feed(size, student.dream), _batch(config))
+    trainer = Trainer(run, "distil", feed, student, updates)
+    about = f"{steps} to {flow_steps} steps a frame, {{}} updates"
     return _trained(pair, run, trainer, student, lambda step: {"distilled": about.format(step)})
+
+
+def _distil_frames(
+    teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report
+) -> dict:
+    """Of a world of frames alone, a student of a smaller preset."""
+    both = config.teacher_weight + config.truth_weight
+    if not 0 < config.teacher_weight < math.inf or not 0 <= config.truth_weight < math.inf:
+        raise TrainingError("--teacher-weight is above 0, and --truth-weight 0 or more.")
+    names = ("steps", "hours", "batch", "learning_rate", "keep_out", "save_every_s", "strip_every_s", "seed")
+    settings = replace(student_settings(teacher, config.preset), **{name: getattr(config, name) for name in names})
+    settings = replace(settings, device=str(teacher.device), flow_steps=config.flow_steps or settings.flow_steps)
+    return train_student(teacher, data, out, settings, report, teaching=config.teacher_weight / both)
 
 
 def train_dreams(
@@ -95,7 +124,8 @@ def train_dreams(
 
     teacher: a world of the same kind that draws a frame in many flow steps (see `distil`).
     """
-    if min(config.steps, config.horizon, config.batch) < 1:
+    batch = _batch(config)
+    if min(config.steps, config.horizon, batch) < 1:
         raise TrainingError("--steps, --horizon and --batch are 1 or more.")
     pair = open_paired(check_posed(world), data, config.keep_out, report)
     dream_starts(pair.recording, config.horizon)
@@ -103,15 +133,15 @@ def train_dreams(
     torch.manual_seed(config.seed)
     weights, rate = (
         (config.truth_weight, config.teacher_weight, config.critic_weight),
-        hold_then_decay(config.learning_rate, 10),
+        hold_then_decay(_rate(config), 10),
     )
     likely = None if teacher is None else teacher.generator
     student = Student("generator", world.generator, world.config.steps, rate, 0.9, weights, likely)
-    dreams = DreamsObjective(student, config.horizon, pair.feed(config.batch).batch)
+    dreams = DreamsObjective(student, config.horizon, pair.feed(batch).batch)
     run = _run(pair, out, config, report, **more)
     batches = lambda size: RandomBatches(lambda now: DreamRollouts(world, pair.recording, config.horizon, size, now))  # noqa: E731
-    trainer = Trainer(run, "dreams", SizedFeed(batches, config.batch), dreams, config.steps)
-    about = lambda step: {"dreams": f"{step * config.batch:,} of {config.horizon} frames"}  # noqa: E731
+    trainer = Trainer(run, "dreams", SizedFeed(batches, batch), dreams, config.steps)
+    about = lambda step: {"dreams": f"{step * batch:,} of {config.horizon} frames"}  # noqa: E731
     return _trained(pair, run, trainer, student, about)
 
 
@@ -139,7 +169,16 @@ def check_teacher(world: LearnedWorld, teacher: LearnedWorld) -> LearnedWorld:
 
 def _run(pair: Paired, out: str | Path, config: PostTraining, report: Report, **more: Any) -> Run:
     facts = {"world": fingerprint(pair.world.generator), "frames": pair.recording.cache.length}
-    return Run.of(out, config, report, pair.device, **facts, **more)
+    settings = replace(config, batch=_batch(config), learning_rate=_rate(config))
+    return Run.of(out, settings, report, pair.device, ("hours",), **facts, **more)
+
+
+def _batch(config: PostTraining) -> int:
+    return 16 if config.batch is None else config.batch
+
+
+def _rate(config: PostTraining) -> float:
+    return 3e-4 if config.learning_rate is None else config.learning_rate
 
 
 def _trained(pair: Paired, run: Run, trainer: Trainer, student: Student, about: Callable[[int], dict]) -> dict:

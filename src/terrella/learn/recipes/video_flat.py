@@ -15,6 +15,7 @@ from ...worlds.config import VideoConfig
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowConfig, FlowNetwork, carry
 from ...worlds.frame_history import FrameHistory, StartClips
+from ...worlds.generator import channels_last
 from ...worlds.learned import LearnedWorld
 from ...worlds.outcome import ConstantConfig, FrameOutcome
 from ..budget import Stage
@@ -43,10 +44,13 @@ MAX_STRESS = 16.0  # but each at most this much: with 128, long trainings get wo
 
 @dataclass(frozen=True)
 class FlowBeginning:
-    """What a training continues: a finished world of frames alone, and a recording of what it learned before, if there is one."""
+    """What a training continues: a finished world of frames alone, and a recording of what it learned before, if there is one.
+    teaching: 0 for the world's own network, which learns on; above, a new network learns, with this weight, what the world draws,
+    and the recorded frames with the rest."""
 
     world: LearnedWorld
     kept: Recording | None = None
+    teaching: float = 0.0
 
 
 class FlowRecipe:
@@ -63,6 +67,7 @@ class FlowRecipe:
         begin: FlowBeginning | None = None,
     ):
         self.begin = begin
+        self.knows_outcome = False
         self.channels = config.channels
         if config.keep_out is not None:
             raise DatasetError(
@@ -82,7 +87,11 @@ class FlowRecipe:
             fitting_rollout(lengths, plain.slots, FLOW_ROLLOUT),
             stress_of(recording, network, config.seed),
         )
-        self.objective = FlowFrames(network, config.learning_rate or 6e-3, rollout, stress)
+        teacher = None
+        if begin is not None and begin.teaching:
+            teacher = channels_last(copy.deepcopy(network_of(begin.world)).to(run.device).eval().requires_grad_(False))
+        teaching = begin.teaching if begin is not None else 0.0
+        self.objective = FlowFrames(network, config.learning_rate or 6e-3, rollout, stress, teacher, teaching)
         if begin is not None and network.scrolling is not None:
             self.objective.freeze_scroll()
         if plan.compiled:
@@ -96,9 +105,10 @@ class FlowRecipe:
     def _network(self, widths: tuple[int, ...]) -> FlowNetwork:
         """A new network for the recording, or a copy of the one that the training continues."""
         if self.begin is not None:
-            generator = self.begin.world.generator
-            assert isinstance(generator, FlowNetwork)
-            self._continue_outcome(self.begin.world)
+            generator = network_of(self.begin.world)
+            self.knows_outcome = self._continue_outcome(self.begin.world) and self.begin.teaching > 0
+            if self.begin.teaching:
+                generator = smaller(generator, widths, self.parts.config.flow_steps)
             return copy.deepcopy(generator).to(self.parts.run.device).train().requires_grad_(True)
         recording, plain, config = self.parts.recording, self.video.generator, self.parts.config
         scrolling = _scrolling_of(self.parts)
@@ -110,11 +120,13 @@ class FlowRecipe:
         network.moves[:], network.over[:] = scrolling.moves, scrolling.over
         return network
 
-    def _continue_outcome(self, world: LearnedWorld) -> None:
-        """The model of rewards and ends goes on from that of the world, where both predict the same."""
+    def _continue_outcome(self, world: LearnedWorld) -> bool:
+        """The model of rewards and ends goes on from that of the world, where both predict the same; whether they do."""
         mine, theirs = self.parts.outcome, world.parts.get("outcome")
-        if mine is not None and isinstance(theirs, FrameOutcome) and mine.config == theirs.config:
-            mine.load_state_dict(theirs.state_dict())
+        if mine is None or not isinstance(theirs, FrameOutcome) or mine.config != theirs.config:
+            return False
+        mine.load_state_dict(theirs.state_dict())
+        return True
 
     def _on_device(self, free_bytes: float) -> tuple[DeviceClips | None, str]:
         """The recording on a GPU with as many bytes free, if there is room for it, and a sentence of that."""
@@ -154,7 +166,7 @@ class FlowRecipe:
 
     def preparations(self) -> list[Stage]:
         scrolls = [Stage("scroll", 0.1, self._learn_scroll)] if self.stitched is not None and self.begin is None else []
-        return [*scrolls, *self.parts.outcome_stages()]
+        return [*scrolls, *([] if self.knows_outcome else self.parts.outcome_stages())]
 
     def _learn_scroll(self) -> None:
         run, network = self.parts.run, self.objective.generator
@@ -177,6 +189,24 @@ class FlowRecipe:
             generator=copy.deepcopy(self.objective.smooth.module).cpu().float(),
             outcome=parts.trained_outcome(ConstantConfig(parts.median_reward)),
         )
+
+
+def network_of(world: LearnedWorld) -> FlowNetwork:
+    """The flow network of a world of frames alone."""
+    assert isinstance(world.generator, FlowNetwork)
+    return world.generator
+
+
+def smaller(teacher: FlowNetwork, widths: tuple[int, ...], steps: int) -> FlowNetwork:
+    """A new network of other widths and drawing steps for the same inputs, which predicts scrolls as the teacher does."""
+    network = FlowNetwork(replace(teacher.config, channels=(widths[0], widths[1], widths[2]), steps=steps))
+    same = {
+        name: part
+        for name, part in teacher.state_dict().items()
+        if name.partition(".")[0] in ("moves", "over", "scrolling")
+    }
+    network.load_state_dict(same, strict=False)
+    return network
 
 
 def _scrolling_of(parts: VideoParts) -> Scrolling:
