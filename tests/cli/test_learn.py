@@ -28,6 +28,7 @@ from terrella.workflows.learn_trial import Pace, forecast, slower, time_environm
 from terrella.workflows.opening import EnvironmentConfig
 from terrella.workflows.results import changed_settings
 from terrella.workflows.results import command as command_line
+from terrella.worlds.folder import load_world
 
 from .tiny import NAME
 
@@ -81,7 +82,7 @@ def test_a_student_is_learned_and_scored_beside_its_world(tmp_path, capsys, monk
     asked = [*command(tmp_path / "two"), "--student"]
     assert main([*asked, "--preset", "medium", "--batch", "1", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    student, teacher = terrella.load(told["student"]), terrella.load(told["world"])
+    student, teacher = (load_world(Path(told[name]) / "world") for name in ("student", "world"))
     assert (student.generator.config.channels, teacher.generator.config.channels) == ((64, 112, 160), (144, 256, 352))
     assert any(line.startswith("two-student is ") for line in told["verdict"])
     assert "two-student" in Path(told["card"]).read_text()

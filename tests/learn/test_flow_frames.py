@@ -132,7 +132,8 @@ def test_a_world_of_a_scrolling_recording_knows_its_ground(flow_run):
     world = load_world(out / "world")
     assert facts["step"] == 32 and world.generator.kind == "flow"
     assert [-2, 0] in world.generator.moves.tolist() and [2, 0] in world.generator.moves.tolist()
-    assert (world.scene.ground[3] > 0).float().mean() > 0.9 and world.scene.ground.shape[2] >= 110
+    ground = world.scene.ground  # pyright: ignore[reportAttributeAccessIssue]
+    assert (ground[3] > 0).float().mean() > 0.9 and ground.shape[2] >= 110
     assert "batches" in check_world(world)
 
 
