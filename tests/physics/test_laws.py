@@ -91,6 +91,16 @@ def test_a_bounce_in_mid_air_does_not_move_gravity():
     assert float(gravity(motion)) == pytest.approx(9.81, rel=1e-3)
 
 
+def test_a_bounce_that_is_blurred_over_two_steps_keeps_its_restitution():
+    """Predictions have a slower ball in the instant after a bounce."""
+    motion = truth("bouncing", 1, 200)
+    speed = motion.velocity.clone()
+    after = (speed[1:, ..., 2] > 0) & (speed[:-1, ..., 2] < 0)
+    speed[1:][after] *= 0.2
+    values = restitution(replace(motion, velocity=speed))
+    assert float(values[values.isfinite()].mean()) == pytest.approx(0.8, rel=0.02)
+
+
 def test_a_constant_that_a_family_does_not_show_is_not_a_number():
     assert gravity(truth("uniform", 1, 200)).isnan().all()
     assert friction(truth("pendulum", 2, 100)).isnan().all()

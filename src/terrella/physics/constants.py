@@ -33,23 +33,29 @@ def gravity(motion: Trajectory) -> Tensor:
 
 
 def restitution(motion: Trajectory) -> Tensor:
-    """The median over bounces from walls of the normal speed after over that before [B], corrected for gravity within the step."""
+    """The median over bounces from walls of the normal speed after over that before [B], corrected for gravity. Speeds are those
+    one step clear of the bounce at either side: predictions blur it over two steps."""
     values, masks = [], []
     speed_of_fall = motion.gravity.norm() * motion.dt_s
     for at, wall in enumerate(motion.system.walls):
-        if wall.normal is None:
+        if wall.normal is None or motion.steps < 3:
             continue
         normal = motion.position.new_tensor(wall.normal)
-        speed, gap = motion.velocity @ normal, motion.wall_gaps[..., at]
-        pull = motion.gravity @ normal
-        before, after = -speed[:-1], speed[1:]
-        share = (gap[:-1].clamp_min(0) / before.clamp_min(1e-9) / motion.dt_s).clamp(0, 1)
-        arrives = before - pull * share * motion.dt_s
-        leaves = after - pull * (1 - share) * motion.dt_s
-        hits = motion.walls_touched[..., at] & (motion.walls_touched.sum(-1) == 1) & ~motion.bodies_touched.any(-1)
-        fast = (before > IMPACT * speed_of_fall.clamp_min(0.02)) & (after > 0)
+        speed, gap, pull = motion.velocity @ normal, motion.wall_gaps[1:-2, ..., at], motion.gravity @ normal
+        turns = (speed[1:-2] < 0) & (speed[2:-1] > 0) & motion.walls_touched[1:-1, ..., at]
+        share = (gap.clamp_min(0) / -speed[1:-2].clamp_max(-1e-9) / motion.dt_s).clamp(
+            0, 1
+        )  # of the step, before the bounce
+        arrives = -speed[:-3] - pull * (1 + share) * motion.dt_s
+        leaves = speed[3:] - pull * (2 - share) * motion.dt_s
+        alone = (
+            motion.both_present
+            & (motion.walls_touched.sum(-1) <= motion.walls_touched[..., at])
+            & ~motion.bodies_touched.any(-1)
+        )
+        fast = (-speed[:-3] > IMPACT * speed_of_fall.clamp_min(0.02)) & (speed[3:] > 0)
         values.append(leaves / arrives.clamp_min(1e-9))
-        masks.append(hits & fast & motion.both_present & ~motion.driven & ~motion.tied)
+        masks.append(turns & fast & alone.unfold(0, 3, 1).all(-1) & ~motion.driven & ~motion.tied)
     if not values:
         return motion.position.new_full((motion.batch,), math.nan)
     return _median(torch.stack(values, -1).flatten(2), torch.stack(masks, -1).flatten(2))
