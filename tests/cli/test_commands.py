@@ -33,7 +33,7 @@ OPTIONS = {
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
     "--pictures --policy --port --randomise --seed --size --task --workers",
-    "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --host --idle --image --json --keys "
+    "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --fps --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
     "practise": "--adapter --episodes --fps --goal --group-size --groups --in --json --learning-rate --minutes "
     "--no-blind --noise --out --randomise --real --reference --reward --save-every-s --seed --size --steps --success --task "

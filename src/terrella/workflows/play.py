@@ -22,6 +22,7 @@ from ..serve.agent import Agents
 from ..serve.guard import is_loopback
 from .key_keeper import KeyKeeper
 from .opening import ControlsConfig, Device, Fast, device_of, load_named
+from .pace import at_pace
 from .page_agents import PageAgents
 from .progress import Progress, silent
 
@@ -55,6 +56,8 @@ class PlayConfig:
     watts: float | None = None
     """Power that play may take, in watts: steps are made slower to keep it, and the page says by how much. Without an energy
     counter that may be read, watts are estimated from processor time."""
+    fps: float | None = None
+    """Frames a second to keep: a world of frames is drawn in fewer steps where this machine needs it, which is said."""
     record: Path | None = None  # Folder of a dataset to which the page can record.
     device: Device = "auto"
     fast: Fast = False
@@ -117,7 +120,8 @@ def _loaded(name: str, config: PlayConfig, progress: Progress) -> World:
             if "rgb" in world.spec.channels and _drawing_s(world) < SLOWEST_S:
                 options["size"] = size
                 break
-    return load_named(name, config.device, config.memory, config.fast, **options)
+    world = load_named(name, config.device, config.memory, config.fast, **options)
+    return world if config.fps is None else at_pace(world, config.fps, progress)
 
 
 def _drawing_s(world: World) -> float:
