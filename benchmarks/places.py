@@ -10,7 +10,7 @@ points in the room's true free space in which the place shows something. Intrusi
 Gaussians lie more than 10 cm within true free space. Beyond: the median distance by which they lie outside the true room. Revisit:
 the start's view after all steps against that before. Each also with the true depth of the picture in place of the lifter's.
 
-rooms: the same of TEXTS, each with two seeds, with the default fill and the lifter's depth.
+rooms: the same of TEXTS, each with two seeds, with the lifter's depth.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -116,7 +115,7 @@ def depth_to_solids(points: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
 
 
 @torch.no_grad()
-def grow(name: str, place: BuiltPlace, out: Path | None, fill: Literal["planes", "lifter"], exact: bool) -> list[float]:
+def grow(name: str, place: BuiltPlace, out: Path | None, exact: bool) -> list[float]:
     """Figures of one room; returns which share of each step's Gaussians intrudes."""
     pose = place.starts[0].clone()
     pose[2] += EYE_M
@@ -132,7 +131,7 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: Literal["planes",
     low, high = place.solids[:, :3].amin(0) + WALL_M, place.solids[:, 3:].amax(0) - WALL_M
     turn = rotation(pose) @ rotation(world.starts[0]).T
     eyes, steps = viewpoints(world, 0), []
-    for step, (more, _) in growth(world, GrowSpaceConfig(fill=fill), eyes):
+    for step, (more, _) in growth(world, GrowSpaceConfig(), eyes):
         points = ratio * (more.means - world.starts[0, :3]) @ turn.T + pose[:3]
         intrusions.append(float((depth_to_solids(points, place.solids) > FREE_M).float().mean()))
         outside.append(torch.maximum(low - points, points - high).clamp_min(0).norm(dim=1))
@@ -147,7 +146,7 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: Literal["planes",
     bad = sum(one > INTRUDING for one in intrusions) / max(len(intrusions), 1)
     kind, last = "true" if exact else "lifted", steps[-1]
     print(
-        f"{name}, {fill}, {kind} depth: {len(steps)} steps in {time.monotonic() - began:.0f} s; own coverage "
+        f"{name}, {kind} depth: {len(steps)} steps in {time.monotonic() - began:.0f} s; own coverage "
         f"{100 * last.coverage:.1f}%, surface {100 * sum(surface) / len(surface):.1f}% (least {100 * min(surface):.1f}%); "
         f"intruding steps {100 * bad:.0f}% (Gaussians {', '.join(f'{100 * one:.0f}' for one in intrusions)}%); seam "
         f"{100 * sum(seams) / len(seams):.1f}%; beyond {float(torch.cat(outside).median()):.2f} m; "
@@ -158,7 +157,7 @@ def grow(name: str, place: BuiltPlace, out: Path | None, fill: Literal["planes",
     if out is not None:
         around = torch.cat([world.starts[0, :3], torch.tensor([1.0, 0, 0, 0])])[None]
         rows = [rasterise(one, around, None, (256, 512)).rgb[0] for one in (world.gaussians, whole)]
-        file = f"grow-{name}-{fill}-{kind}.png".replace(" ", "-")
+        file = f"grow-{name}-{kind}.png".replace(" ", "-")
         Image.fromarray(to_bytes(torch.cat(rows, 1)).numpy()).save(out / file)
     return intrusions
 
@@ -168,7 +167,7 @@ def rooms(out: Path | None) -> None:
     steps = []
     for seed in SEEDS:
         for text in TEXTS:
-            steps += grow(f"{text} {seed}", built(text, seed=seed), out, "planes", False)
+            steps += grow(f"{text} {seed}", built(text, seed=seed), out, False)
     bad = sum(one > INTRUDING for one in steps)
     print(f"{bad} of {len(steps)} steps intrude ({100 * bad / len(steps):.0f}%)")
 
@@ -188,9 +187,8 @@ def main() -> None:
             panorama(name, ROOMS[name], given.out)
         else:
             place = built(ROOMS[name])
-            grow(name, place, given.out, "planes", False)
-            grow(name, place, given.out, "lifter", False)
-            grow(name, place, given.out, "planes", True)
+            grow(name, place, given.out, False)
+            grow(name, place, given.out, True)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,7 @@ OPTIONS = {
     "adapt": "--batch --device --from --json --keep --learning-rate --minutes --no-laws --out --seed --steps",
     "check": "--coarse --data --device --fresh --json --metres-per-pixel --out --pictures --rollouts --seed --steps --system",
     "space lift": "--collider --depth --eye --fov --json --longest --out --panorama",
-    "space grow": "--fill --json --seed --steps --to",
+    "space grow": "--json --seed --steps --to",
     "list": "--json",
     "data doctor": "--json --out --repair --yes",
     "data convert": "--episodes --fps --json --pictures --policy --seed --to",

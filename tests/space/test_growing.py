@@ -17,19 +17,16 @@ from terrella.space.growing import (
     coverage,
     grow_step,
     known_around,
-    lifted_fill,
     next_view,
     planar_fill,
     psnr_of,
-    push_pull,
 )  # fmt: skip
-from terrella.space.lifting.network import Lifter, LifterConfig
 from terrella.space.lifting.panorama import panorama_gaussians
 from terrella.space.raster import Gaussians, join, rasterise
 from terrella.space.raster.gaussians import plain_sh
 from terrella.space.raster.move import transform
 from terrella.space.room_planes import room_planes
-from terrella.workflows.grow_space import GrowSpaceConfig, depth_error, fill_of
+from terrella.workflows.grow_space import depth_error, fill_of
 from terrella.workflows.splat_places import open_splat
 from terrella.worlds.additions import INVENTED
 from terrella.worlds.splat import SplatConfig, SplatWorld
@@ -84,7 +81,7 @@ def test_the_expected_error_of_a_place_says_how_far_out_its_planes_lie(tmp_path)
         place.card["depth_error"] = error
         assert depth_error(place) == share
     place.card["depth_error"] = 0.2
-    near, far = (fill_of(one, GrowSpaceConfig()) for one in (open_splat(str(tmp_path / "place")), place))
+    near, far = (fill_of(one) for one in (open_splat(str(tmp_path / "place")), place))
     pose = planar_pose(ZERO, ZERO, EYE[2], torch.tensor(math.atan2(1.0, -0.3)))
     drawn = rasterise(place.gaussians, pose[None], CAMERA, (9, 9))
     assert float(far(drawn, pose)[0][4, 4] / near(drawn, pose)[0][4, 4]) == pytest.approx(
@@ -120,22 +117,6 @@ def test_what_would_cover_a_seen_surface_is_left_out():
     cameras = [(planar_pose(ZERO, ZERO, EYE[2], ZERO), CAMERA)]
     points = EYE + torch.tensor([[[1.0, 0, 0], [2.5, 0.5, 0], [3.1, 0, 0], [5.0, 0, 0], [-1.0, 0, 0]]])
     assert growing._covers(front(), points, cameras)[0].tolist() == [True, True, False, False, False]
-
-
-def test_holes_of_a_picture_are_interpolated():
-    picture = torch.linspace(0, 1, 32).expand(3, 32, 32)
-    known = torch.ones(32, 32, dtype=torch.bool)
-    known[10:20, 10:20] = False
-    filled = push_pull(torch.where(known, picture, 0.0), known)
-    assert torch.equal(filled[:, known], picture[:, known]) and float((filled - picture).abs().max()) < 0.15
-
-
-def test_a_lifter_fills_with_depth_that_fits_the_known():
-    torch.manual_seed(0)
-    scene = front()
-    view = next_view(known_around(scene, EYE[None]), EYE[None])
-    step = grow_step(scene, view, lifted_fill(Lifter(LifterConfig(32, (8, 8, 16, 16))).eval()), [])
-    assert len(step.gaussians) > 1000 and step.seam < 0.5
 
 
 def test_a_place_grows_is_undone_and_goes_on(tmp_path, capsys):

@@ -327,3 +327,13 @@ def test_a_plain_wall_is_named_with_its_measured_reason():
     flat = replace(layers, depth=torch.full((48, 64), 2.0), error=torch.full((48, 64), 0.4))
     assert "1.00 times" in doubts(flat)[0] and "40%" in doubts(flat)[1]
     assert "contrast 0.000" in doubts(replace(flat, rgb=torch.full((3, 48, 64), 0.5)))[0]
+
+
+def test_a_page_of_text_and_a_fisheye_are_named():
+    page = torch.ones(3, 48, 64)
+    page[:, 10:14:2, 5:60] = 0
+    layers = replace(a_box_before_a_wall(), rgb=page, error=torch.full((48, 64), 0.1))
+    assert doubts(layers)[0].startswith("96% of the picture is one colour")
+    row, column = torch.meshgrid(torch.arange(48) - 24, torch.arange(64) - 32, indexing="ij")
+    circle = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0)) * (row**2 + column**2 < 24**2)
+    assert "fisheye" in doubts(replace(layers, rgb=circle))[0]

@@ -8,9 +8,7 @@ import torch
 import torch.nn.functional as F
 
 from .camera import Intrinsics, directions, project, rays, rotation
-from .lifting.layers import layers_of, of_pixels
-from .lifting.network import Lifter
-from .lifting.prior import fitted_depth
+from .lifting.layers import of_pixels
 from .lifting.scenes import rotation_of
 from .raster import Drawing, Gaussians, rasterise
 from .raster.move import quaternion_of
@@ -76,34 +74,6 @@ def planar_fill(planes: RoomPlanes) -> Fill:
         return depth.view(size), colour.T.reshape(3, *size)
 
     return fill
-
-
-def lifted_fill(lifter: Lifter) -> Fill:
-    """Fills with what a lifter makes of the drawing, whose unknown part is blended in from its surroundings: its depth gets the
-    factor and tilt by which it fits the known."""
-
-    def fill(drawn: Drawing, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        alpha = drawn.alpha[0]
-        known = alpha >= KNOWN
-        picture = push_pull(drawn.rgb[0] / alpha.clamp_min(KNOWN), known).clamp(0, 1)
-        layers = layers_of((255 * picture.permute(1, 2, 0)).byte().numpy(), lifter, CAMERA[0])
-        surface = torch.where(known, drawn.depth[0] / alpha.clamp_min(1e-3), 0.0)
-        depth = fitted_depth(layers.depth, surface)
-        return layers.depth if depth is None else depth, picture
-
-    return fill
-
-
-def push_pull(picture: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
-    """A picture [3, H, W] whose unknown pixels are interpolated from the known ones (bool [H, W]), coarse to fine."""
-    weight = known.float()[None]
-    if min(known.shape) <= 1 or bool(known.all()):
-        return picture
-    pad = (0, known.shape[1] % 2, 0, known.shape[0] % 2)
-    total, many = (F.avg_pool2d(F.pad(part, pad), 2) for part in (picture * weight, weight))
-    small = push_pull(total / many.clamp_min(1e-6), many[0] > 0)
-    coarse = F.interpolate(small[None], scale_factor=2.0, mode="bilinear")[0][:, : known.shape[0], : known.shape[1]]
-    return torch.where(known, picture, coarse)
 
 
 @dataclass(frozen=True)

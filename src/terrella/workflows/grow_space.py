@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,12 +21,10 @@ from ..space.growing import (
     coverage,
     grow_step,
     known_around,
-    lifted_fill,
     next_view,
     planar_fill,
     psnr_of,
 )
-from ..space.lifting.network import load_lifter
 from ..space.occupancy import Occupancy
 from ..space.raster import Gaussians, join, rasterise
 from ..space.room_planes import room_planes
@@ -52,8 +50,6 @@ class GrowSpaceConfig:
     to: float = 0.98  # Share of all directions, from points where one can stand, that shall be known.
     steps: int = 40  # Steps, at most.
     seed: int = 0  # Seed of the points that the cameras stand at.
-    fill: Literal["planes", "lifter"] = "planes"
-    """What fills the unknown: walls, floor and ceiling of a room, or what the lifter makes of a blurred continuation."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +119,7 @@ def growth(
     """The steps, and of each the Gaussians and the pose of its camera."""
     gaussians, start = place.gaussians, place.starts[0]
     cameras: list[tuple[torch.Tensor, Intrinsics]] = [(start, place.config.camera)]
-    fill = fill_of(place, config)
+    fill = fill_of(place)
     first = _drawn(gaussians, start, place.config)
     known, tried = known_around(gaussians, eyes), torch.zeros(len(eyes), *known_around(gaussians, eyes[:1]).shape[1:])
     number = 0
@@ -146,10 +142,8 @@ def growth(
         yield facts, (step.gaussians, view.pose)
 
 
-def fill_of(place: SplatWorld, config: GrowSpaceConfig) -> Fill:
+def fill_of(place: SplatWorld) -> Fill:
     """What fills the unknown of a place."""
-    if config.fill == "lifter":
-        return lifted_fill(load_lifter())
     seen = place.gaussians.at(place.provenance == OBSERVED)
     return planar_fill(
         room_planes(seen if len(seen) else place.gaussians, place.starts[0, :3], DEVIATION * depth_error(place))

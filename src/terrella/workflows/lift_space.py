@@ -30,6 +30,7 @@ from .splat_places import SpaceResult
 MOST_ASPECT = 4.0
 NARROWEST = 256  # pixels of the width of a panorama
 UNSURE, FLAT, PLAIN = 0.27, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
+ONE_COLOUR, RIM = 0.5, 0.95  # share of pixels of one colour; of the dark ones outside the circle that a fisheye fills
 EYE_M = (0.3, 2.2)  # heights of eyes that walk
 AXES = "x forward, y left, z up; metres; floor at 0"
 
@@ -171,12 +172,32 @@ def doubts(layers: PictureLayers) -> list[str]:
         notes.append(
             f"the picture shows little depth (its far parts are {ratio:.2f} times as far as its near ones): a wall, a logo or text?"
         )
+    elif (share := _share_of_one_colour(layers.rgb)) > ONE_COLOUR:
+        notes.append(
+            f"{100 * share:.0f}% of the picture is one colour, as of text, a logo or a cut-out figure: nothing shows its depth."
+        )
+    if _is_round(layers.rgb):
+        notes.append("the picture is round, as a fisheye's: straight lines come out bent; rectify it before.")
     if error > UNSURE:
         notes.append(
             f"the network is unsure of the depth (it estimates an error of {100 * error:.0f}%; for pictures like those "
             f"it learned from, below {100 * UNSURE:.0f}%): the place may be wrong."
         )
     return notes
+
+
+def _share_of_one_colour(rgb: torch.Tensor) -> float:
+    """The share of pixels of a picture [3, H, W] in 0..1 that have its commonest colour, in steps of 1/64."""
+    steps = (63 * rgb).round().long().flatten(1)
+    return float(((steps[0] * 64 + steps[1]) * 64 + steps[2]).bincount().max() / steps.shape[1])
+
+
+def _is_round(rgb: torch.Tensor) -> bool:
+    """Whether a picture [3, H, W] in 0..1 is black outside the circle that touches its nearer sides, and not within."""
+    high, wide = rgb.shape[1:]
+    row, column = torch.meshgrid(torch.arange(high) - 0.5 * high, torch.arange(wide) - 0.5 * wide, indexing="ij")
+    far, dark = (row.square() + column.square()).sqrt() / (0.5 * min(high, wide)), rgb.amax(0) < 0.06
+    return float(dark[far > 1.05].float().mean()) > RIM and float(dark[far < 0.9].float().mean()) < 0.5
 
 
 def _frames(picture: Path) -> list[str]:

@@ -49,6 +49,7 @@ class SplatFit:
     # A point in free space (x y z in metres), from which inside and outside are distinguished. Default: the first camera.
     inside: tuple[float, float, float] | None = None
     fit: FitConfig = field(default_factory=FitConfig)
+    """The fit itself."""
 
 
 def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedViews, Mapping[str, Any], list[str]]:
