@@ -30,7 +30,7 @@ from .splat_places import SpaceResult
 MOST_ASPECT = 4.0
 NARROWEST = 256  # pixels of the width of a panorama
 UNSURE, FLAT, PLAIN = 0.27, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
-ONE_COLOUR, RIM = 0.5, 0.95  # share of pixels of one colour; of the dark ones outside the circle that a fisheye fills
+ONE_COLOUR, RIM = 0.6, 0.95  # share of pixels of one colour; of the dark ones outside the circle that a fisheye fills
 EYE_M = (0.3, 2.2)  # heights of eyes that walk
 AXES = "x forward, y left, z up; metres; floor at 0"
 
