@@ -79,7 +79,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "place"
         if film:
-            jpegs = [(simplejpeg.encode_jpeg(frame, quality=95),) for frame in frames]
+            jpegs = [(simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=95),) for frame in frames]
             (source := Path(folder) / "film.mp4").write_bytes(make_clip(jpegs, 1 / FPS))
             result = terrella.generate_place(out, video=source, config=config)
         else:

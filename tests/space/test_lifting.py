@@ -26,6 +26,7 @@ from terrella.space.lifting.prior import fitted_depth
 from terrella.space.lifting.scenes import rotation_of
 from terrella.space.raster import rasterise
 from terrella.workflows.lift_space import doubts, expected_error, place_of
+from terrella.workflows.splat_places import open_splat
 
 TINY = LifterConfig(32, (8, 8, 16, 16))
 
@@ -77,8 +78,8 @@ def test_rays_meet_boxes_as_those_of_layouts_do_and_round_shapes_where_they_are(
     bounds = np.array([[*s[1:4], np.linalg.norm(s[4:7]), k, k + 1] for k, s in enumerate(shapes)], np.float32)
     hits = 0
     for way in rng.normal(0, 1, (200, 3)) + [2, 0, 0]:
-        expected, far, _ = first_box(-4.0, 0.1, 0.2, *way.tolist(), boxes, 1e9)
-        which, near, *normal = kernels.trace(shapes, bounds, -4.0, 0.1, 0.2, *way.tolist(), 1e-4, 1e9)
+        expected, far, _ = first_box(-4.0, 0.1, 0.2, way[0], way[1], way[2], boxes, 1e9)
+        which, near, *normal = kernels.trace(shapes, bounds, -4.0, 0.1, 0.2, way[0], way[1], way[2], 1e-4, 1e9)
         assert which == expected and (which < 0 or abs(near - far) < 1e-4 * far)
         hits += which >= 0
         assert which < 0 or abs(np.linalg.norm(normal) - 1) < 1e-5 and np.dot(normal, way) < 0
@@ -260,7 +261,7 @@ def lifted(path, tmp_path, capsys, *more):
 def test_a_picture_becomes_a_place_that_opens(tmp_path, capsys):
     code, facts = lifted(picture_file(tmp_path / "a.png"), tmp_path, capsys)
     assert code == 0 and facts["seen"] == 64 * 43 and facts["gaussians"] == facts["seen"] + facts["invented"]
-    world = terrella.load(tmp_path / "place")
+    world = open_splat(str(tmp_path / "place"))
     assert world.card["picture"] == "a.png" and "floor at 0" in world.card["axes"]
     assert int((world.provenance == 1).sum()) == facts["seen"] and float(world.starts[0, 2]) == pytest.approx(
         facts["height_m"], abs=0.01
@@ -274,7 +275,7 @@ def test_one_function_makes_places_of_all_sources(tmp_path):
     facts = terrella.generate_place(
         tmp_path / "p", image=picture, config=terrella.LiftSpaceConfig(longest=64, eye=2.0)
     ).facts
-    assert facts["height_m"] == 2.0 and float(terrella.load(tmp_path / "p").starts[0, 2]) == 2.0
+    assert facts["height_m"] == 2.0 and float(open_splat(str(tmp_path / "p")).starts[0, 2]) == 2.0
     small = terrella.BuildSpaceConfig(gaussians=1000, size=(24, 32))
     assert terrella.generate_place(tmp_path / "t", text="a tiny room", config=small).facts["rooms"] == 1
     with pytest.raises(TerrellaError, match="give one of"):
@@ -292,7 +293,7 @@ def test_photographs_of_all_kinds(tmp_path, capsys):
     exif[274] = 6  # lies on its side
     turned = lifted(picture_file(tmp_path / "t.jpg", exif=exif), tmp_path, capsys)[1]
     assert turned["seen"] == 64 * 43
-    world = terrella.load(tmp_path / "place")
+    world = open_splat(str(tmp_path / "place"))
     assert world.spec.cameras["rgb"].size[0] > world.spec.cameras["rgb"].size[1]
     clear = Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 4), np.uint8), "RGBA")
     clear.save(tmp_path / "c.png")
