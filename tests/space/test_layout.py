@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from terrella.core.errors import ContractError
+from terrella.space.camera import rotation
 from terrella.space.edits import apply_edits
 from terrella.space.kernels_numba.light import first_box
 from terrella.space.layout import build, looks, parse_text, read_layout, text_layout
@@ -261,3 +262,12 @@ def test_the_floor_is_darker_at_the_foot_of_a_table():
     behind = means[:, 1] - 2.3  # metres
     foot, away = (floor & (behind > a) & (behind < b) for a, b in ((0.0, 0.06), (0.6, 0.9)))
     assert foot.any() and grey[foot].mean() < 0.85 * grey[away].mean()
+
+
+def test_what_ends_beneath_a_board_does_not_stick_out_above_it():
+    shelf = {"label": "bookshelf", "at": [1.5, 2.7], "facing": "south"}
+    place = build(read_layout({"rooms": [{**ROOM, "size": [3, 3, 3]}], "things": [shelf]}), 20_000)
+    own = place.gaussians.at((place.objects == 1) & (place.gaussians.opacities > 0.3))
+    turn = rotation(torch.cat([torch.zeros_like(own.means), own.quats], 1))
+    top = own.means[:, 2] + (turn[:, 2] * 2 * own.scales).norm(dim=1)  # of two standard deviations; it is 2 m high
+    assert int((top[own.means[:, 2] < 1.96] > 2.05).sum()) < 30  # 56 before uprights ended at their visible end

@@ -207,16 +207,19 @@ def _own(plan: RoomLayout, blocks: Blocks, boxes: np.ndarray, fine: Grid) -> np.
 
 
 def _edges(fine: Grid, kinds: np.ndarray, boxes: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Where cells lie at an edge with air beyond it, at once or after something thin: uint8 [M], bits 1, 2, 4, 8 for the
-    low and high row and column."""
+    """Where cells lie at the end of a side, or of what is visible of it, with air beyond it, at once or after something thin:
+    uint8 [M], bits 1, 2, 4, 8 for the low and high row and column."""
     edges = np.zeros(len(kinds), np.uint8)
-    rows = np.arange(len(kinds)) - fine.starts[fine.faces]
-    across = fine.counts[fine.faces, 1]
+    numbers_of_all, across = np.arange(len(kinds)), fine.counts[fine.faces, 1]
+    rows = numbers_of_all - fine.starts[fine.faces]
     place = np.stack([rows // across, rows % across], 1)
     for axis in (0, 1):
         along = AXES[fine.sides // 2, axis]
         for high in (0, 1):
-            ends = np.flatnonzero((place[:, axis] == high * (fine.counts[fine.faces, axis] - 1)) & (kinds == 1))
+            last = place[:, axis] == high * (fine.counts[fine.faces, axis] - 1)
+            beside = numbers_of_all + (2 * high - 1) * (across if axis == 0 else 1)
+            hidden = kinds[np.where(last, 0, beside)] == 0  # within another box, such as a board
+            ends = np.flatnonzero((last | hidden) & (kinds == 1))
             kind = shapes[fine.blocks[ends]]
             ends = ends[
                 (kind[:, 4] == 0) & ((kind[:, 1] == 0) | (fine.sides[ends] > 3) | (along[ends] == 2))
