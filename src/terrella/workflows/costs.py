@@ -12,7 +12,7 @@ from ..core.policy import Random
 from ..core.world import World, make_rng
 from ..learn.recipes.policy import device_of
 from ..measure.acceleration import Throughput, measure_throughput
-from ..measure.costs import EnergyMeter, growth, timed_play
+from ..measure.costs import WARM, EnergyMeter, growth, timed_play
 from .opening import Device, Fast, load_named
 from .progress import Progress, silent
 from .results import jsonable, table_lines
@@ -102,12 +102,12 @@ def measure_costs(world: str, config: CostsConfig | None = None, *, progress: Pr
 def costs_of(mine: World, name: str, config: CostsConfig, progress: Progress = silent) -> Costs:
     """The same of a World."""
     spec, rng = mine.spec, make_rng(config.seed)
-    steps, done = max(20, round(60 * config.minutes / spec.dt_s)), 0
+    steps, done = max(20, round(60 * config.minutes / spec.dt_s)), -WARM
 
     def tick(count: float) -> None:
         nonlocal done
         done += count
-        if done % max(1, steps // 4) == 0:
+        if done > 0 and done % max(1, steps // 4) == 0:
             progress(f"{name}: {done:,.0f} of {steps:,} steps are played")
 
     start = mine.start(1, rng)
