@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..gaps import rotated
 from ..system import PhysicalSystem, Wall
-from ..trajectory import Trajectory
+from ..trajectory import SKIN, Trajectory
 from .law import SINGLE, largest, occasions, shifted, with_last
 
 PUSHES = 3  # of a correction
@@ -47,7 +47,8 @@ class NonPenetration:
         return torch.maximum(walls, largest(gaps.clamp_min(0), gaps > 0))
 
     def floor(self, motion: Trajectory) -> float:
-        return SINGLE * float(motion.position.abs().max().clamp_min(1.0))
+        seen = 2 * SKIN * self.ceiling(motion) if motion.system.tracked else 0.0  # pictures show places no better
+        return max(seen, SINGLE * float(motion.position.abs().max().clamp_min(1.0)))
 
     def ceiling(self, motion: Trajectory) -> float:
         return 0.5 * float(motion.size[motion.present].amin())
