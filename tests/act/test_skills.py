@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -101,6 +101,19 @@ def test_what_a_phrase_leaves_out_is_named_before():
         ("grasp a and lift it",),
         ("b", "c"),
     )
+
+
+def test_what_was_left_out_for_want_of_an_effect_is_said():
+    library = library_of()
+    search = SkillSearch(
+        replace(library, skills=library.skills[:1], card={"without_effect": ["pick up the blue|red key"]})
+    )
+    with pytest.raises(
+        PlanningError, match="'pick up the red key', for its end looks like any other moment. There are: go"
+    ):
+        search.instructions_of("pick up the red key")
+    with pytest.raises(PlanningError, match="'pick up the red box'. There are: go"):
+        search.instructions_of("pick up the red box")
 
 
 def test_the_likeliest_order_is_found():

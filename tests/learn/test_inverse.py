@@ -82,7 +82,13 @@ def test_clips_without_actions_are_labelled_by_another_recording(recording, tmp_
     about = tmp_path / "clips" / "meta" / "terrella.json"
     about.write_text(about.read_text().replace(NAME.rpartition(":")[2], "Other-v0"))
     assert main([*words[: -len(QUICK) - 1], str(tmp_path / "other"), *QUICK]) == 2
-    assert "is of gym:Other-v0, and the labels" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "is of gym:Other-v0, and the labels" in said and "label clips of the same environment." in said
+    about.write_text(
+        about.read_text().replace("Other-v0", NAME.rpartition(":")[2]).replace("Discrete(3)", "Discrete(4)")
+    )
+    assert main([*words[: -len(QUICK) - 1], str(tmp_path / "other"), *QUICK]) == 2
+    assert "has actions in Discrete(4), and the labels" in capsys.readouterr().err
 
 
 def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, capsys):

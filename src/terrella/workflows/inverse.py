@@ -162,12 +162,14 @@ def _clips(
     mine, theirs = (one.dataset.world if one.dataset else one.cache.world for one in (clips, labels))
     if mine.get("name") and theirs.get("name") and mine["name"] != theirs["name"]:
         raise DatasetError(
-            f"{clips.name} is of {mine['name']}, and the labels of {labels.name} are of {theirs['name']}."
+            f"{clips.name} is of {mine['name']}, and the labels of {labels.name} are of {theirs['name']}: "
+            "label clips of the same environment."
         )
     if clips.cache.action is not None and mine.get("action_space") != theirs.get("action_space"):
         spaces = mine.get("action_space"), theirs.get("action_space")
         raise DatasetError(
-            f"{clips.name} has actions in {spaces[0]}, and the labels of {labels.name} are in {spaces[1]}."
+            f"{clips.name} has actions in {spaces[0]}, and the labels of {labels.name} are in {spaces[1]}: "
+            "record both with the same actions."
         )
     return clips
 

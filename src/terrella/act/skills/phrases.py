@@ -37,6 +37,11 @@ class Phrase:
     def __str__(self) -> str:
         return " ".join("|".join(place) for place in self.places)
 
+    @staticmethod
+    def of(text: str) -> Phrase:
+        """The phrase of its own text, the inverse of str()."""
+        return Phrase(tuple(tuple(place.split("|")) for place in text.split()))
+
     def fillings(self, words: Sequence[str]) -> list[str]:
         """The instructions of this phrase that these words leave open; [] if they do not fit. Articles may be left out.
         PlanningError for more than MOST_FILLINGS."""

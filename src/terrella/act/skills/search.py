@@ -14,7 +14,7 @@ from ...core.similar import did_you_mean
 from ...core.world import Observation
 from ..sentences import words_of
 from .library import Skill, SkillLibrary
-from .phrases import ARTICLES, PRONOUNS, completed, goal_of, things_of
+from .phrases import ARTICLES, PRONOUNS, Phrase, completed, goal_of, things_of
 
 STEP_COST = 0.002  # of a step, in nats: of two orders that are as likely the shorter one
 LEAST_ENDS = 4  # ends of the same instruction from which these alone are what it brings about
@@ -89,7 +89,10 @@ class SkillSearch:
             fits = next(filter(None, map(self._fits, completed(phrase, things))), fits)
         if not fits:
             names = "; ".join(skill.name for skill in self.library.skills)
-            raise PlanningError(f"no skill does '{phrase}'. There are: {names}.")
+            left_out = [Phrase.of(one) for one in (self.library.card or {}).get("without_effect", ())]
+            dull = any(one.fillings(words_of(phrase)) for one in left_out)
+            why = ", for its end looks like any other moment" if dull else ""
+            raise PlanningError(f"no skill does '{phrase}'{why}. There are: {names}.")
         return fits
 
     def _fits(self, phrase: str) -> tuple[str, ...]:

@@ -160,7 +160,7 @@ def learn_skills(
     bare = SkillLibrary((), network, predictor.eval(), {}, (), 0.0, card)
     tested = EndTest.of(bare, test if segments.success[test.picked].any() else train)
     library, without = _library(bare, tested, phrases, train)
-    library = library.named_as(out)
+    library = replace(library, card={**card, "without_effect": without}).named_as(out)
     library.write(out)
     return library, {**trainer.summary, **tested.facts(), "without_effect": without}
 
