@@ -16,13 +16,14 @@ from tests.learn.test_imitation import COLOURS, QUICK, teacher
 import terrella
 from terrella.act.imitation import load_imitation_network
 from terrella.act.skills.actor import SkillActor
+from terrella.act.skills.library import SkillLibrary
 from terrella.cli import main
 from terrella.core.errors import PlanningError
 from terrella.core.world import make_rng
 from terrella.data import record
 from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
-from terrella.learn.recipes.skills import Segments
+from terrella.learn.recipes.skills import Segments, lasting
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
 
@@ -143,6 +144,28 @@ def test_skills_are_learned_from_long_recordings_and_planned_with(library, capsy
     )
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert rows["library"]["dream"]["value"] > 0.8
+
+
+def test_what_looks_done_for_a_moment_is_told_from_what_stays_so():
+    none = -torch.inf
+    looks = torch.tensor([[0.0, 5, 1, 4, 4, none], [2, 2, 2, none, none, none]])
+    assert lasting(looks, 4).tolist() == [[5, 2], [4, 2], [1, 2], [1, none]]
+    assert lasting(looks[:, :1], 3).tolist() == [[0, 2], [none, none], [none, none]]
+
+
+def test_an_instruction_is_over_when_it_has_looked_done_for_long_enough(library):
+    """The same episode: the library that asks for three moments in a row goes on two steps later than that which asks for one."""
+    assert learned(library) == 0
+    world, once = GymnasiumWorld(Both), SkillLibrary.load(library[0])
+    steps = []
+    for hold in (1, 3):
+        actor, rng = SkillActor(replace(once, hold=hold), world.spec), make_rng(0)
+        state, memory, at = world.start(1, make_rng(5)), actor.begin(1, rng), 0
+        while not memory[0].at and at < 30:
+            action, memory = actor.act(world.render(state, actor.sees), memory, rng)
+            state, at = world.imagine(state, action, rng), at + 1
+        steps.append(at)
+    assert steps[1] == steps[0] + 2 < 30
 
 
 def test_a_skill_is_renamed_tried_and_listed(library, capsys):

@@ -65,22 +65,23 @@ class SkillActor:
         hidden = fast["features"][:, 0].to(self.library.network.mean.device) if self.library.network.memory else None
         waypoints = fast["waypoints"].to(self.library.network.mean.device) if self.library.network.waypoints else None
         done = self.library.outlook(seen, texts, hidden, waypoints).done.cpu() > self.library.threshold
+        memory = [replace(one, looks_done=(one.looks_done + 1) * over) for one, over in zip(memory, done.tolist())]
         memory = [
-            self._thought(one, str(goal), bool(over), {name: value[row : row + 1] for name, value in seen.items()})
-            for row, (one, goal, over) in enumerate(zip(memory, goals, done.tolist()))
+            self._thought(one, str(goal), {name: value[row : row + 1] for name, value in seen.items()})
+            for row, (one, goal) in enumerate(zip(memory, goals))
         ]
         texts = torch.stack([torch.tensor(text_to_bytes(one.text)) for one in memory])
         action, fast = self.policy.act({**seen, TEXT: texts}, State.stack([one.fast for one in memory]), rng)
         return action, [replace(one, fast=fast.at(row), steps=one.steps + 1) for row, one in enumerate(memory)]
 
-    def _thought(self, one: SkillMemory, goal: str, done: bool, seen: Observation) -> SkillMemory:
+    def _thought(self, one: SkillMemory, goal: str, seen: Observation) -> SkillMemory:
         """The memory before the next action: with a plan, and the instruction that is due."""
         if goal != one.goal:
             return self._begun(replace(one, goal=goal, groups=self.search.instructions_of(goal), plan=None), seen, goal)
         if one.plan is None or one.at == len(one.plan.steps):
             return one
         step, left = one.plan.steps[one.at], len(one.plan.steps) - one.at
-        if done and one.steps >= max(1, step.skill.least_steps):
+        if one.looks_done >= self.library.hold and one.steps >= max(1, step.skill.least_steps):
             one = self._next(one, f"{step.text}: done after {one.steps} steps")
             if left == 1:
                 return one
@@ -95,7 +96,7 @@ class SkillActor:
 
     def _next(self, one: SkillMemory, event: str) -> SkillMemory:
         assert self._blank is not None
-        return replace(one, at=one.at + 1, steps=0, fast=self._blank, events=(*one.events, event))
+        return replace(one, at=one.at + 1, steps=0, looks_done=0, fast=self._blank, events=(*one.events, event))
 
     def _begun(self, one: SkillMemory, seen: Observation, why: str) -> SkillMemory:
         """A new plan for what is left to do."""
@@ -110,5 +111,13 @@ class SkillActor:
         shown += "" if plan.imagined is None else f", {plan.imagined:.0%} of its rollouts end"
         events = (*one.events, f"{why}: {shown}")
         return replace(
-            one, groups=groups, plan=plan, at=0, steps=0, fast=self._blank, plans=one.plans + 1, events=events
+            one,
+            groups=groups,
+            plan=plan,
+            at=0,
+            steps=0,
+            looks_done=0,
+            fast=self._blank,
+            plans=one.plans + 1,
+            events=events,
         )

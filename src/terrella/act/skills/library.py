@@ -57,6 +57,7 @@ class SkillLibrary:
     ends: Mapping[str, torch.Tensor]  # channel -> [E, ...]
     end_texts: tuple[str, ...]  # the instruction of each end; "" for the starts of any instruction, which come last
     threshold: float = 0.0  # log odds of `done` from which an instruction counts as done
+    hold: int = 1  # moments in a row above it
     card: Mapping[str, Any] | None = None
 
     def named(self, name: str) -> Skill:
@@ -123,7 +124,7 @@ class SkillLibrary:
         """Writes the folder, each file atomically; CheckpointError if it cannot be written."""
         folder = Path(folder)
         skills = [{**asdict(skill), "phrase": skill.phrase.places} for skill in self.skills]
-        config = {"skills": skills, "end_texts": self.end_texts, "threshold": self.threshold}
+        config = {"skills": skills, "end_texts": self.end_texts, "threshold": self.threshold, "hold": self.hold}
         ImitationActor.write(self.network, folder / FAST_FOLDER, {})
         write_policy(
             folder, {"kind": KIND, "version": VERSION, "config": config, "card": self.card or {}}, self.predictor
@@ -153,6 +154,7 @@ class SkillLibrary:
             skills = tuple(
                 Skill(**{**one, "phrase": Phrase(tuple(map(tuple, one["phrase"])))}) for one in config["skills"]
             )
-            return SkillLibrary(skills, network, predictor, ends, tuple(config["end_texts"]), config["threshold"], card)
+            texts, cut, hold = tuple(config["end_texts"]), config["threshold"], config.get("hold", 1)
+            return SkillLibrary(skills, network, predictor, ends, texts, cut, hold, card)
         except DAMAGE as error:
             raise CheckpointError(f"{folder} is damaged or incomplete ({error}); copy or learn it again.") from error

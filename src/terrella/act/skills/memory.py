@@ -19,6 +19,7 @@ class SkillMemory:
     steps: int  # actions since it began
     fast: State  # the memory of the policy
     plans: int = 0
+    looks_done: int = 0  # observations in a row at which the instruction looks done
     events: tuple[str, ...] = ()  # what was planned, done and planned anew, for people
 
     @property

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ...act.imitation import load_imitation_network
 from ...act.imitation_network import ImitationNetwork
@@ -25,6 +26,10 @@ from ..recording import Recording
 from ..trainer import Report, Run, Trainer
 
 STAGE = "skills"
+MOST_HOLD, HOLD_COST = (
+    6,
+    0.01,
+)  # moments in a row that look done, at most; what one more must gain in segments that end rightly
 AT_ONCE = 256  # moments of which features are computed
 MOST_ENDS = 256  # ends that a library keeps of a skill
 MOST_MOMENTS = 64  # of a segment: the last ones
@@ -157,7 +162,7 @@ def learn_skills(
     trainer = Trainer(run, STAGE, feed, SkillPrediction(network, predictor, config.learning_rate), config.steps)
     trainer.train(lambda: None)
     card = {"what": f"Skills of {recording.name}", "learned_from": recording.name}
-    bare = SkillLibrary((), network, predictor.eval(), {}, (), 0.0, card)
+    bare = SkillLibrary((), network, predictor.eval(), {}, (), card=card)
     tested = EndTest.of(bare, test if segments.success[test.picked].any() else train)
     library, without = _library(bare, tested, phrases, train)
     library = replace(library, card={**card, "without_effect": without}).named_as(out)
@@ -184,7 +189,9 @@ def _library(
         name = phrase.name if names[phrase.name] == 1 else f"{phrase.name} {names[phrase.name]}"
         skills.append(_skill(phrase, name, numbers, train.segments))
     ends, texts = _ends(train, list(kept.values()))
-    return replace(bare, skills=tuple(skills), threshold=tested.threshold, ends=ends, end_texts=texts), without
+    return replace(
+        bare, skills=tuple(skills), threshold=tested.threshold, ends=ends, end_texts=texts, hold=tested.hold
+    ), without
 
 
 def _numbers(tasks: Sequence[str], texts: Sequence[str]) -> np.ndarray:
@@ -197,8 +204,9 @@ class EndTest:
     """How well the ends of instructions are recognised among moments on the way, on segments that training did not see."""
 
     threshold: float  # log odds at which most segments are ended at their end and not before
+    hold: int  # moments in a row that it takes
     task: np.ndarray  # [n], of each tested segment
-    on_way: np.ndarray  # bool [n]: a moment on the way is taken for the end
+    on_way: np.ndarray  # bool [n]: that many moments on the way are taken for the end
     at_end: np.ndarray  # bool [n]: the end is recognised
 
     @staticmethod
@@ -211,12 +219,15 @@ class EndTest:
             batch = test.at(part, rng)
             done = library.predictor(*recalled_moments(library.network, batch)).done.view(batch.left.shape)
             end = (batch.left == 0).float().argmax(1)
-            highest = done.masked_fill(batch.left <= 0, -torch.inf).amax(1)
-            parts.append(torch.stack([done[torch.arange(len(part)), end], highest]).cpu())
-        end, way = torch.cat(parts, 1).numpy()
-        cuts = np.quantile(np.concatenate([way, end]), np.linspace(0.01, 0.99, 99))
-        cut = cuts[int(np.argmax([((end > one) & (way <= one)).mean() for one in cuts]))]
-        return EndTest(float(cut), s.task[won], way > cut, end > cut)
+            lasted = lasting(done.masked_fill(batch.left <= 0, -torch.inf), MOST_HOLD)
+            parts.append(torch.cat([done[torch.arange(len(part)), end][None], lasted]).cpu())
+        end, *ways = torch.cat(parts, 1).numpy()
+        cuts = np.quantile(np.concatenate([ways[0], end]), np.linspace(0.01, 0.99, 99))
+        right = np.array([[((end > cut) & (way <= cut)).mean() for cut in cuts] for way in ways])
+        right -= HOLD_COST * np.arange(len(ways))[:, None]
+        hold, best = np.unravel_index(int(right.argmax()), right.shape)
+        cut, way = float(cuts[best]), ways[hold]
+        return EndTest(cut, int(hold) + 1, s.task[won], way > cut, end > cut)
 
     def effect(self, tasks: np.ndarray) -> float:
         """By how much more often their ends are taken for the end than a whole way to it; 1 where none was tested."""
@@ -228,7 +239,18 @@ class EndTest:
             "ends_recognised": round(float(self.at_end.mean()), 4),
             "ended_too_early": round(float(self.on_way.mean()), 4),
             "tested_segments": len(self.task),
+            "hold": self.hold,
         }
+
+
+def lasting(looks: torch.Tensor, most: int) -> torch.Tensor:
+    """Of values [n, T] the highest that 1, 2, ... `most` moments in a row reach: [most, n]; minus infinity beyond T."""
+    rows, current, length = list[torch.Tensor](), looks, looks.shape[1]
+    for number in range(1, most + 1):
+        rows.append(current.amax(1))
+        later = F.pad(looks[:, number:], (0, min(number, length)), value=-torch.inf)
+        current = torch.minimum(current, later)
+    return torch.stack(rows)
 
 
 def _skill(phrase: Phrase, name: str, tasks: np.ndarray, segments: Segments) -> Skill:
