@@ -29,7 +29,7 @@ from terrella.worlds.folder import load_world, save_world
 # Whoever changes an option changes what people have in their scripts: change it here on purpose.
 OPTIONS = {
     "learn": "--action-names --adapter --batch --device --fps --frames --idle --json --keys --minutes --no-compile --no-half --out "
-    "--policy --practise --preset --randomise --seed --size --student --task",
+    "--policy --practise --preset --randomise --seed --size --student --task --workers",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
     "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
     "--pictures --policy --port --randomise --seed --size --task --workers",

@@ -22,7 +22,8 @@ from terrella.data import Dataset
 from terrella.learn.recipes.video import TrainConfig, TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
-from terrella.workflows.learn import LearnConfig, held_to_real_time
+from terrella.workflows.learn import LearnConfig
+from terrella.workflows.learn_environment import held_to_real_time
 from terrella.workflows.learn_schedule import DISTILLING, RECORDING, SCORING, TRAINING, LearnSchedule, folder_for
 from terrella.workflows.learn_trial import Pace, forecast, slower, time_environment
 from terrella.workflows.opening import EnvironmentConfig

@@ -105,7 +105,7 @@ def collect(world: str | Path, config: CollectConfig, *, progress: Progress = si
     """
     config.check()
     rgb, policy = config.pictures != "none", config.policy or "explorer"
-    make = partial(_open_player, str(world), config.controls, config.environment, rgb, policy)
+    make = partial(open_player, str(world), config.controls, config.environment, rgb, policy)
     opened, make_policy = make()
     for line in describe(opened.spec):
         progress(line)
@@ -125,7 +125,7 @@ def collect_doom(config: DoomRecordConfig, *, progress: Progress = silent) -> Co
     return _record(world, config, config.frames, "video", None, progress)
 
 
-def _open_player(name: str, controls: ControlsConfig, environment: EnvironmentConfig, rgb: bool, policy: str):
+def open_player(name: str, controls: ControlsConfig, environment: EnvironmentConfig, rgb: bool, policy: str):
     """A world, and a function that makes its policy: in a worker, too."""
     world = controls.of(environment.open(name, rgb=rgb))
     return world, lambda: policy_of(policy, world.spec, world)

@@ -1,9 +1,10 @@
 """`learn`: from an environment's id to a playable world with a scorecard, within a number of minutes."""
 
 import math
-import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +14,27 @@ from .. import library
 from ..act.policies_by_name import policy_of
 from ..core.errors import DatasetError, TerrellaError
 from ..core.world import World, make_rng
-from ..data import Dataset, RecordOptions
-from ..data.recording import LONGEST
+from ..data import Dataset, Layout, RecordOptions
+from ..data.collect import Job
 from ..learn.devices import describe_device, free_bytes, one_thread, yield_cores
 from ..learn.presets import PRESETS, PresetName, TrainingPlan
 from ..learn.recipes.student import student_settings, train_student
 from ..learn.recipes.video import TrainConfig, train_video
-from ..learn.recording import MOST, learned_size
+from ..learn.recording import MOST
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
 from ..worlds.folder import load_world
-from .collect import explore, storage_of
+from .collect import explore, open_player, storage_of
+from .learn_environment import held_to_real_time, longest_episode, open_small
 from .learn_schedule import DISTILLING, RECORDING, SCORING, STUDENTS_SHARE, TRAINING, LearnSchedule, folder_for
 from .learn_trial import FEW_STEPS, HOPELESS_STEPS, forecast, slower, time_environment
 from .opening import ControlsConfig, Device, EnvironmentConfig, device_of, load_named
 from .progress import Progress, Report, duration, silent, stage, stopping_with
+from .record_meanwhile import Recorded, recording_meanwhile, spare_workers
 from .recording_facts import describe, recording_facts
 from .results import changed_settings, command, jsonable
 from .score import QUICK_HORIZONS, ExamRequest, arms_of, digest_of, exam_of, write_card
 
 ENDLESS = 10**9  # steps: training ends with its time
-EPISODES = 12  # recorded at least, shorter ones if need be: scoring needs some that training did not see
 CLIP_COUNTS, FEWEST_CLIPS = (50, 24, 12, 6, 3), 6  # scoring takes the most clips for which there is time
 SAVE_EVERY_S = 30.0
 SMALL = (
@@ -40,12 +42,9 @@ SMALL = (
 )  # pixels of a picture at most, in fewer minutes than SHORT_MIN: more pixels learn too little in that time
 SHORT_MIN = 60
 FEW_FRAMES, FEWEST_FRAMES = 600, 100  # a slow game is recorded for up to a third of the time until it has 600 frames
-REAL_TIME_FPS, HELD_FPS = (
-    32,
-    25,
-)  # steps per second that a learned world plays on two cores; faster games are held to 25
 STRIPS = 20  # pictures of truth and prediction in a training, at most
 STUDENT = "student"  # a folder, and the arm of its score
+FURTHER = "recording-further"  # a folder, recorded while training has begun
 _DOES = {
     RECORDING: "records for up to",
     TRAINING: "trains for",
@@ -77,6 +76,9 @@ class LearnConfig:
     batch: int | None = None  # Frames per training step. Default: 8 on a CPU, 64 on a GPU.
     compile: bool = True  # --no-compile: on a GPU, train the network as it is.
     half: bool = True  # --no-half: train in float32 where the device computes bfloat16.
+    # Processes that go on recording up to --frames while a world without depth trains. Default: on 4 cores or more some that
+    # training leaves free, otherwise 0.
+    workers: int | None = None
     controls: ControlsConfig = ControlsConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
 
@@ -299,8 +301,38 @@ class _Learning:
 
     def _train(self, report: Report) -> dict[str, object]:
         folder = self.schedule.folder
-        facts = train_video(folder / RECORDING, folder / "run", self._training, report, self._paced, self.progress)
+        further = folder / FURTHER
+        with self._recording_on(further) as recorded:
+
+            def shown(*what: Any) -> None:
+                if recorded is not None and (line := recorded.trouble()):
+                    self.progress(line)
+                report(*what)
+
+            training = self._training
+            facts = train_video(
+                folder / RECORDING, folder / "run", training, shown, self._paced, self.progress, meanwhile=further
+            )
         return {"world": facts["world"], "steps": facts["step"]}
+
+    def _recording_on(self, out: Path) -> AbstractContextManager[Recorded | None]:
+        """Records on in other processes while a world of frames alone trains, where there are cores and frames are lacking."""
+        config, dataset, facts = self.config, Dataset(self.schedule.folder / RECORDING), self.schedule.facts
+        cuda = device_of(config.device) != "cpu"
+        workers = spare_workers(cuda) if config.workers is None else config.workers
+        lacking = config.frames - dataset.length
+        if workers < 1 or lacking < 2 or (dataset.has("depth") and dataset.has("pose")):
+            return nullcontext()
+        policy = config.policy or "explorer"
+        environment, size = config.environment, dataset.sensors[dataset.rgb_key].shape[:2] if dataset.rgb_key else None
+        if facts["opened"].startswith("gym:"):
+            environment = replace(environment, size=size)
+        make = partial(open_player, facts["opened"], config.controls, environment, True, policy)
+        spec = make()[0].spec
+        layout = replace(Layout.of(spec), pictures=storage_of(spec))
+        job = replace(Job.of(make, spec, make_rng(config.seed + 1), layout), steps=facts["longest"])
+        self.progress(f"{workers} processes record up to {lacking:,} frames more while it trains (--workers).")
+        return recording_meanwhile(job, out, workers, lacking)
 
     @property
     def _training(self) -> TrainConfig:
@@ -349,51 +381,6 @@ class _Learning:
         if student:
             lines += verdict(replace(card, worlds={STUDENT: card.worlds[STUDENT]}))[:2]
         return {"verdict": lines, "card": str(files[1])}
-
-
-def held_to_real_time(name: str, environment: EnvironmentConfig) -> str:
-    """The environment's name, with each action held for several of its steps (gym:ID@N) where it has more steps per second than
-    are played in real time."""
-    if not name.startswith("gym:") or "@" in name or environment.fps:
-        return name
-    world = environment.open(name)
-    rate = 1 / world.spec.dt_s
-    if callable(close := getattr(world, "close", None)):
-        close()
-    return name if rate <= REAL_TIME_FPS else f"{name}@{max(2, round(rate / HELD_FPS))}"
-
-
-def open_small(name: str, environment: EnvironmentConfig, most: int) -> World:
-    """The environment, with pictures of the size at which they are learned, of `most` pixels, if that is smaller."""
-    world = environment.open(name)
-    drawn = world.spec.channels.get("rgb")
-    if drawn is None:
-        raise TerrellaError(
-            f"{name} shows no pictures, and a world is learned from them; an environment draws itself as rgb_array, "
-            "or its observation is a picture."
-        )
-    height, width = (drawn.shape or (0, 0))[:2]
-    if environment.size or not name.startswith("gym:") or height * width <= most:
-        return world
-    if callable(close := getattr(world, "close", None)):
-        close()
-    return replace(environment, size=learned_size(height, width, most)).open(name)
-
-
-def longest_episode(world: World, frames: int, seconds: float) -> int:
-    """The most steps of an episode with which several episodes are recorded in the time, by a trial of a few steps."""
-    rng = make_rng(0)
-    state = world.start(1, rng)
-    began, done = time.monotonic(), 0
-    while done < 20 or (done < 200 and time.monotonic() - began < 1):
-        state = world.imagine(state, world.spec.sample_action(1, rng), rng)
-        seen = world.render(state, list(world.spec.channels))
-        done += 1
-        if "done" in seen and bool(seen["done"][0]):
-            state = world.start(1, rng)
-    pace_s = (time.monotonic() - began) / done
-    expected = min(frames, seconds / pace_s)
-    return min(world.spec.max_episode_steps or LONGEST, LONGEST, max(100, int(expected / EPISODES)))
 
 
 def _longest_exam(request: ExamRequest, report: Report) -> tuple[Exam, str]:

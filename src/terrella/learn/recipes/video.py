@@ -43,12 +43,15 @@ def train_video(
     paced: Paced | None = None,
     say: Callable[[str], object] = lambda line: None,
     begin: FlowBeginning | None = None,
+    meanwhile: Path | None = None,
 ) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
-    `Trainer.train`, of the generator's steps. `say` is given a sentence of what is about to be trained. `begin`: see `adapt`."""
-    recipe = _recipe(data, out, config, report, begin=begin)
+    `Trainer.train`, of the generator's steps. `say` is given a sentence of what is about to be trained. `begin`: see `adapt`.
+    meanwhile: the folder of another recording of the same kind, which may grow; a world of frames alone learns its new episodes,
+    too, with each picture of truth and prediction."""
+    recipe = _recipe(data, out, config, report, begin=begin, meanwhile=meanwhile)
     say(recipe.plan.sentence(describe_device(str(recipe.plan.device)), recipe.channels))
-    return _Training(recipe, paced).learn()
+    return _Training(recipe, paced, say).learn()
 
 
 class TrainingPace(NamedTuple):
@@ -91,6 +94,7 @@ def _recipe(
     report: Report,
     minutes: float | None = None,
     begin: FlowBeginning | None = None,
+    meanwhile: Path | None = None,
 ) -> VideoRecipe:
     """What is learned from the recording, by a preset for `minutes`, by default those of the settings. TrainingError or
     DatasetError for settings and recordings that do not fit."""
@@ -116,14 +120,16 @@ def _recipe(
     video = video_config(recording, config)
     if video.geometry:
         return PosedRecipe(run, recording, config, video, plan)
-    return FlowRecipe(run, recording, config, video, plan, begin)
+    return FlowRecipe(run, recording, config, video, plan, begin, meanwhile)
 
 
 class _Training:
     """The stages of a run, each of which resumes where it was stopped."""
 
-    def __init__(self, recipe: VideoRecipe, paced: Paced | None = None):
-        self.recipe, self.parts, self.paced = recipe, recipe.parts, paced
+    def __init__(
+        self, recipe: VideoRecipe, paced: Paced | None = None, say: Callable[[str], object] = lambda line: None
+    ):
+        self.recipe, self.parts, self.paced, self.say = recipe, recipe.parts, paced, say
         self.run, self.config = recipe.parts.run, recipe.parts.config
         self.stages = [
             *recipe.preparations(),
@@ -154,7 +160,7 @@ class _Training:
         if not trainer.finished:
             discard_uncertainty(self.run.out)  # it was fitted to the errors of an earlier generator
             trainer.facts.pop("senses", None)
-        trainer.train(self._save_with_strip, self.paced)
+        trainer.train(self._show, self.paced)
 
     def _limit_s(self) -> float:
         """Seconds of the generator's training: what the preparations left of the hours, less what the uncertainty will take by a
@@ -184,6 +190,13 @@ class _Training:
         sensing, facts = learn_senses(self.run, world, self.parts.recording, config.keep_out, settings)
         save_world(sensing.replaced(card=facts), self.run.out / "world")
         trainer.compute_once("senses", lambda: facts)
+
+    def _show(self) -> None:
+        """Saves the world with a picture, and takes in what was recorded since."""
+        self._save_with_strip()
+        growing = self.recipe.growing if isinstance(self.recipe, FlowRecipe) else None
+        if growing is not None and growing.pick_up():
+            self.say(f"It trains on {growing.further:,} frames more, recorded meanwhile.")
 
     def _save_with_strip(self) -> LearnedWorld:
         """Saves the world as it now is, so that it can be played while it trains, and a picture of truth above rollouts of it,

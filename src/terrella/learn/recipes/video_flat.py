@@ -2,11 +2,13 @@
 
 import copy
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...core.errors import DatasetError, TrainingError, is_out_of_memory
+from ...data import Dataset
 from ...space.ground import joined
 from ...space.matching import scroll_index
 from ...space.mosaic import read_mosaic
@@ -22,6 +24,7 @@ from ..budget import Stage
 from ..device_clips import ROOM, DeviceClips, DeviceGrounds, bytes_of
 from ..devices import free_bytes
 from ..feeds import ClipStream, clips_of, fitting_rollout
+from ..growing_feed import GrowingFeed
 from ..moves import Scrolling, StitchedEpisodes, changed_pixels, mosaics, stitch_episodes
 from ..objectives.flow_frames import FlowClipMaker, FlowFrames
 from ..objectives.scroll import learn_scroll
@@ -65,8 +68,11 @@ class FlowRecipe:
         video: VideoConfig,
         plan: TrainingPlan,
         begin: FlowBeginning | None = None,
+        meanwhile: Path | None = None,
     ):
-        self.begin = begin
+        """meanwhile: the folder of a recording that may grow while training has begun."""
+        self.begin, self.meanwhile = begin, meanwhile
+        self.growing: GrowingFeed | None = None
         self.knows_outcome = False
         self.channels = config.channels
         if config.keep_out is not None:
@@ -148,6 +154,38 @@ class FlowRecipe:
 
     def feed(self, batch: int) -> Feed:
         """Clips chosen from three times as many, preferring those that change more; on a GPU from all, which lie there."""
+        first = self._first_feed(batch)
+        if self.meanwhile is None:
+            return first
+        rows = int(self.parts.recording.usable.sum())
+        self.growing = GrowingFeed(first, rows, self._counted, lambda episodes: self._further_feed(batch, episodes))
+        return self.growing
+
+    def _counted(self) -> tuple[int, int]:
+        """Episodes and rows of what is recorded meanwhile."""
+        if self.meanwhile is None or not (self.meanwhile / "meta" / "info.json").exists():
+            return 0, 0
+        dataset = Dataset(self.meanwhile)
+        return len(dataset.episodes), dataset.length
+
+    def _further_feed(self, batch: int, episodes: int) -> tuple[Feed, int]:
+        """Clips of the first episodes of what is recorded meanwhile, and their rows."""
+        assert self.meanwhile is not None
+        mine, run = self.parts.recording, self.parts.run
+        opened = Recording.open(self.meanwhile, self.video.size, run.report, joined=mine.cameras)
+        recording = replace(
+            Recording.of(opened.cache, list(range(episodes)), None), controls=mine.controls, cameras=mine.cameras
+        )
+        moves, device = self.objective.generator.moves.cpu(), run.device
+        stitched = stitch_episodes(recording, moves, self.over) if len(moves) > 1 else None
+        rows = int(recording.usable.sum())
+        if self.held is None:
+            return self._clips(recording, stitched, 2 * batch), rows
+        grounds = None if stitched is None else DeviceGrounds(stitched, self.over, device)
+        clips = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
+        return clips.sized(2 * batch), rows
+
+    def _first_feed(self, batch: int) -> Feed:
         if self.held is not None:
             return self.held.sized(2 * batch)
         if self.begin is None or self.begin.kept is None:
