@@ -2,6 +2,7 @@
 
     make bench-gpu                      # eight minutes at most on one card; needs the wheels in NEEDED beside PyTorch
     make bench-gpu ARGS=--cpu           # rehearses all of it on a CPU, with small networks and batches: its figures say nothing
+    make bench-gpu ARGS="--learn gym:ALE/Breakout-v5 gym:ALE/Pong-v5 --minutes 10"   # instead: from an id to a score, one by one
 
 Prints a table and writes bench-gpu.json.
 """
@@ -9,6 +10,7 @@ Prints a table and writes bench-gpu.json.
 from __future__ import annotations
 
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +32,7 @@ import terrella  # noqa: E402
 from terrella.core import chance, make_rng  # noqa: E402
 from terrella.core.backend import tensor_programs  # noqa: E402
 from terrella.core.dispatch import Dispatches  # noqa: E402
+from terrella.core.errors import TerrellaError  # noqa: E402
 from terrella.learn.feeds import RandomBatches  # noqa: E402
 from terrella.learn.objectives.flow_frames import FlowClips, FlowFrames  # noqa: E402
 from terrella.learn.recipes.video_flat import FLOW_ROLLOUT as ROLLOUT  # noqa: E402
@@ -75,6 +78,8 @@ class Settings:
     seconds: float = 5.0  # Of each row.
     compile: bool = True  # --no-compile: steps are captured as they are.
     out: Path = Path("bench-gpu.json")
+    learn: tuple[str, ...] = ()  # Environments that `terrella learn` learns instead, one after the other.
+    minutes: float = 10.0  # Of each of these.
 
     @property
     def device(self) -> torch.device:
@@ -113,8 +118,8 @@ BARS = {
     "arm": (60, ((65_536, 4.3e6),)),
 }
 ELSEWHERE = {  # bars that take longer than this script, and the command that measures each
-    "ten minutes from id to score": "terrella learn gym:ALE/Breakout-v5 --device cuda --minutes 10, and so for each game",
-    "beside DIAMOND's own code": "train both on one recording for the same minutes; terrella score has the PSNR and the distance",
+    "ten minutes from id to score": "--learn gym:ALE/Breakout-v5 gym:ALE/Pong-v5 ... --minutes 10",
+    "beside DIAMOND's own code": "lab/atari_beside_diamond.py",
 }
 
 
@@ -250,6 +255,28 @@ def robot(row: Row, settings: Settings) -> Row:
     return row
 
 
+def learned(name: str, settings: Settings) -> dict[str, Any]:
+    """What `terrella learn` makes of an environment in the minutes: steps, seconds of each stage, the verdict of its score."""
+    out = settings.out.parent / "bench-learned" / re.sub(r"[^\w.-]+", "-", name)
+    config = terrella.LearnConfig(minutes=settings.minutes, out=out, device=settings.device.type)
+    try:
+        result = terrella.learn(name, config, progress=print)
+    except TerrellaError as error:
+        return {"environment": name, "error": str(error)}
+    facts = {"environment": name, "minutes": settings.minutes, "steps": result.steps, "seconds": dict(result.spent_s)}
+    return facts | {"verdict": list(result.verdict), "card": str(result.card)}
+
+
+def learn_all(settings: Settings) -> int:
+    """Learns the environments, nothing beside them: a compilation takes the cores that a recording needs."""
+    found = []
+    for name in settings.learn:
+        found.append(learned(name, settings))
+        print("\n".join([name, *found[-1].get("verdict", [found[-1].get("error", "")])]), flush=True)
+        settings.out.write_text(json.dumps({"rehearsal": settings.cpu, "learned": found}, indent=1))
+    return 1 if any("error" in one for one in found) else 0
+
+
 def runs_per_second(run: Callable[[], Any], settings: Settings) -> float:
     run()
     run()
@@ -310,6 +337,8 @@ def main(settings: Settings) -> int:
     if not settings.cpu and not torch.cuda.is_available():
         print("PyTorch finds no CUDA device here; ARGS=--cpu rehearses the script on a CPU.")
         return 2
+    if settings.learn:
+        return learn_all(settings)
     absent = [name for name in ("mujoco", "mjlab", "mujoco_warp", "warp") if not find_spec(name)]
     if absent:
         print(f"Without {', '.join(absent)}: MuJoCo on the card is not measured.")

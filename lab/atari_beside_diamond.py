@@ -36,6 +36,8 @@ SIZE, CONTEXT, HORIZONS, CLIPS = (64, 64), 4, (1, 8, 32), 50
 
 def import_diamond(checkout: Path) -> types.SimpleNamespace:
     """What is needed of a checkout; the packages that its training stack logs and configures with are not."""
+    if not (checkout / "src" / "models" / "diffusion").is_dir():
+        sys.exit(f"{checkout} is no checkout of DIAMOND: git clone https://github.com/eloialonso/diamond {checkout}")
     for name, needed in (("wandb", ()), ("omegaconf", ("OmegaConf",))):
         sys.modules.setdefault(name, types.ModuleType(name))
         for part in needed:

@@ -20,6 +20,7 @@ from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClip
 from terrella.learn.recipes.student import student_settings, train_student
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recording import Recording
+from terrella.learn.subcloning import subclone
 from terrella.learn.train_step import TrainStep
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
@@ -166,6 +167,22 @@ def test_a_teacher_is_as_much_of_the_target_as_is_said():
     alone, half = losses_of(0.0, False), losses_of(0.5, True)
     assert losses_of(0.0, True) == alone
     assert all(0.2 * alone[name] < half[name] < 0.6 * alone[name] for name in alone)
+
+
+def test_a_student_begins_with_channels_of_its_teacher():
+    wide, narrow = (FlowConfig((16, 16), 2, 36 + 2, 2, channels=widths) for widths in ((32, 24, 16), (16, 16, 8)))
+    torch.manual_seed(0)
+    teacher, same, student = FlowNetwork(wide), FlowNetwork(wide), FlowNetwork(narrow)
+    torch.nn.init.normal_(teacher.output.weight, std=0.1)
+    own = [name for name, _ in teacher.named_parameters() if not name.startswith("scrolling")]
+    weights, whole = dict(teacher.named_parameters()), dict(subclone(teacher, same).named_parameters())
+    assert all(torch.equal(whole[name], weights[name]) for name in own), "of as many channels all"
+    part = dict(subclone(teacher, student).named_parameters())
+    for name, gain in (("before.0.first.weight", 2**0.5), ("enter.weight", 1.0)):  # of 32 channels 16: they weigh more
+        kept = part[name].flatten()[:200] / gain
+        assert torch.isclose(weights[name].flatten()[:, None], kept).any(0).all(), name
+    assert torch.equal(part["output.weight"], weights["output.weight"])
+    assert not torch.equal(part["after.3.first.bias"], FlowNetwork(narrow).after[3].first.bias)
 
 
 def test_a_student_is_a_smaller_world_of_the_same_game(scrolling, tmp_path):

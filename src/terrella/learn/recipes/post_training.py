@@ -33,7 +33,7 @@ class PostTraining:
     batch: int | None = None
     # Peak learning rate of the generator. Default: 3e-4, and without depth 6e-3.
     learning_rate: float | None = None
-    teacher_weight: float = 1.0  # Weight of the teacher's distribution, if there is a teacher.
+    teacher_weight: float = 1.0  # Weight of the teacher's distribution, if there is a teacher (worlds with depth).
     # A box x0 y0 x1 y1 of the map in metres that training never sees. Default: the one that was kept out of the world's training.
     keep_out: Box | None = None
     save_every_s: float = 60.0  # Seconds between saves.
@@ -103,13 +103,10 @@ def _distil_frames(
     teacher: LearnedWorld, data: str | Path, out: str | Path, config: DistilConfig, report: Report
 ) -> dict:
     """Of a world of frames alone, a student of a smaller preset."""
-    both = config.teacher_weight + config.truth_weight
-    if not 0 < config.teacher_weight < math.inf or not 0 <= config.truth_weight < math.inf:
-        raise TrainingError("--teacher-weight is above 0, and --truth-weight 0 or more.")
     names = ("steps", "hours", "batch", "learning_rate", "keep_out", "save_every_s", "strip_every_s", "seed")
     settings = replace(student_settings(teacher, config.preset), **{name: getattr(config, name) for name in names})
     settings = replace(settings, device=str(teacher.device), flow_steps=config.flow_steps or settings.flow_steps)
-    return train_student(teacher, data, out, settings, report, teaching=config.teacher_weight / both)
+    return train_student(teacher, data, out, settings, report)
 
 
 def train_dreams(

@@ -20,7 +20,7 @@ from .video import train_video
 from .video_config import TrainConfig
 from .video_flat import FlowBeginning, network_of
 
-TEACHING = 0.8  # weight of what the teacher draws, against the recorded frames
+TEACHING = 0.5  # weight of what the teacher draws, against the recorded frames
 
 
 def student_settings(teacher: LearnedWorld, preset: PresetName = "small") -> TrainConfig:
@@ -40,13 +40,13 @@ def train_student(
     paced: Paced | None = None,
     say: Callable[[str], object] = lambda line: None,
 ) -> dict:
-    """Trains, or resumes, a student in the folder `out`; its world is in `out`/world. It draws in its own rollouts, and its targets
-    are the recorded frames and what the teacher draws from the same history. Returns the facts of the run, with the GFLOP of a
-    frame of both. TrainingError where it would be no smaller."""
+    """Trains, or resumes, a student in the folder `out`; its world is in `out`/world. It begins with the teacher's most important
+    channels and draws in its own rollouts; its targets are the recorded frames and what the teacher draws from the same history.
+    Returns the facts of the run, with the GFLOP of a frame of both. TrainingError where it would be no smaller."""
     large = network_of(teacher).config
     named = {one.name: one.channels for one in PRESETS}
     widths = settings.channels or named.get(settings.preset, PRESETS[0].channels)
-    if widths >= large.channels:
+    if widths == large.channels or any(narrow > wide for narrow, wide in zip(widths, large.channels)):
         raise TrainingError(
             f"{teacher.spec.name} has {_words(large.channels)} channels, and a student of {_words(widths)} is no smaller; a "
             "teacher comes from `terrella train video --preset medium` or larger."

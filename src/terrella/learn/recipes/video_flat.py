@@ -33,6 +33,7 @@ from ..recording import Recording
 from ..rehearsal import Rehearsal
 from ..run_folder import resume_file
 from ..sized_feed import Feed
+from ..subcloning import subclone
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
 from .video_parts import VideoParts
@@ -236,7 +237,7 @@ def network_of(world: LearnedWorld) -> FlowNetwork:
 
 
 def smaller(teacher: FlowNetwork, widths: tuple[int, ...], steps: int) -> FlowNetwork:
-    """A new network of other widths and drawing steps for the same inputs, which predicts scrolls as the teacher does."""
+    """A narrower network for the same inputs, which begins with a part of the teacher's weights and predicts scrolls as it does."""
     network = FlowNetwork(replace(teacher.config, channels=(widths[0], widths[1], widths[2]), steps=steps))
     same = {
         name: part
@@ -244,7 +245,7 @@ def smaller(teacher: FlowNetwork, widths: tuple[int, ...], steps: int) -> FlowNe
         if name.partition(".")[0] in ("moves", "over", "scrolling")
     }
     network.load_state_dict(same, strict=False)
-    return network
+    return subclone(teacher, network)
 
 
 def _scrolling_of(parts: VideoParts) -> Scrolling:
