@@ -44,11 +44,11 @@ def import_diamond(checkout: Path) -> types.SimpleNamespace:
             setattr(sys.modules[name], part, object)
     torch.utils.data.Sampler.__init__ = lambda self, data_source=None: None  # which took an argument, once
     sys.path.insert(0, str(checkout / "src"))
-    import models.diffusion as diffusion
-    import utils
-    from data.utils import make_segment
+    import models.diffusion as diffusion  # pyright: ignore[reportMissingImports]
+    import utils  # pyright: ignore[reportMissingImports]
+    from data.utils import make_segment  # pyright: ignore[reportMissingImports]
 
-    import data
+    import data  # pyright: ignore[reportMissingImports]
 
     return types.SimpleNamespace(data=data, diffusion=diffusion, utils=utils, make_segment=make_segment)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from dataclasses import replace
 from functools import partial
@@ -41,7 +39,7 @@ def test_it_records_beside_and_says_where_it_ended(job, tmp_path):
         ended(recorded)
         assert recorded.trouble() is None and Dataset(tmp_path / "out").length >= 60
     with recording_meanwhile(job, tmp_path / "out", 1, 10_000) as recorded:
-        os.kill(recorded._process.pid, signal.SIGKILL)
+        recorded._process.kill()
         ended(recorded)
         said = recorded.trouble() or ""
         assert "Recording has stopped: its process ended (-9). Training goes on" in said and recorded.trouble() is None
