@@ -1,4 +1,4 @@
-"""Measures the page of a place without a graphics card: pictures a second in headless Chromium while one turns and walks.
+"""Measures the page of a place without a graphics card: pictures a second in headless Chromium while one turns.
 
 python benchmarks/page.py [--gaussians 200000] [--seconds 20] [--text "a cosy library at night"]
 
@@ -20,16 +20,7 @@ import terrella
 from terrella.workflows.export_space import ExportSpaceConfig, export_space
 
 FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update")
-TURN = """seconds => new Promise(done => {
-  const from = [...terrella.eye.place], began = performance.now(), first = terrella.drawing.shown;
-  (function next() {
-    const now = (performance.now() - began) / 1000;
-    const view = document.getElementById('view');
-    if (now > seconds) return done([(terrella.drawing.shown - first) / now, view.width, view.height]);
-    terrella.stand([from[0] + 0.3 * Math.sin(now), from[1], from[2]], 0.6 * now, 0);
-    requestAnimationFrame(next);
-  })();
-})"""
+STATE = "[terrella.drawing.shown, document.getElementById('view').width, document.getElementById('view').height]"
 
 
 def processor_s(root: int) -> float:
@@ -65,12 +56,14 @@ def main() -> None:
         page.goto(html.as_uri())
         while not page.evaluate("!!window.terrella && terrella.idle"):
             time.sleep(0.5)
-        page.evaluate(TURN, 10.0)  # until the page has chosen its resolution
-        used, began = processor_s(os.getpid()), time.monotonic()
-        rate, wide, high = page.evaluate(TURN, given.seconds)
-        used, passed = processor_s(os.getpid()) - used, time.monotonic() - began
+        page.keyboard.down("ArrowLeft")  # one turns on the spot
+        page.wait_for_timeout(10_000)  # until the page has chosen its resolution
+        (first, _, _), used, began = page.evaluate(STATE), processor_s(os.getpid()), time.monotonic()
+        page.wait_for_timeout(1000 * given.seconds)
+        (last, wide, high), used = page.evaluate(STATE), processor_s(os.getpid()) - used
+        own, rate = used / (time.monotonic() - began), (last - first) / (time.monotonic() - began)
+        page.keyboard.up("ArrowLeft")
         browser.close()
-    own = used / passed
     print(
         f"{facts['gaussians']:,} Gaussians, {wide} x {high} pixels: {rate:.1f} pictures a second by the clock; "
         f"{1000 * own / rate:.0f} ms of processor each, so {2 * rate / own:.1f} a second of two cores; the browser had "

@@ -65,6 +65,13 @@ def test_a_floor_goes_on_over_holes_and_ends_a_metre_beyond_what_is_known(room):
         assert torch.allclose(walked(plain, way), walked(closed, way), atol=0.11)
 
 
+def test_a_soft_table_top_through_which_the_floor_shines_stops_walkers(room):
+    top = slab((0.8, 1.2, 0.75), (1.4, 2.8, 0.75))
+    soft = replace(top, opacities=torch.full((len(top),), 0.5))
+    closed = enclosed(join([room, soft]), EYE, "indoor", BODY)
+    assert bool(closed.blocked(torch.tensor([[1.1, 2.0, 1.6]]), BODY)) and walked(closed, (-0.1, 0))[0] > 1.4
+
+
 def test_haze_of_fits_stops_nobody_where_one_begins_nor_on_the_way(room):
     haze = join([room, slab((2.2, 2.0, 0.7), (2.25, 2.05, 0.8)), slab((1.0, 1.9, 1.0), (1.05, 1.95, 1.1))])
     plain, closed = (enclosed(haze, EYE, kind, BODY) for kind in ("open", "indoor"))

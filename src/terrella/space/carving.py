@@ -10,7 +10,7 @@ import torch.nn.functional as F
 
 from .camera import directions
 from .flooring import floored, standing
-from .occupancy import Occupancy, Walker
+from .occupancy import SOLID, Occupancy, Walker
 from .raster import Gaussians, rasterise
 from .walkable import spread_out, walkable
 
@@ -18,6 +18,7 @@ ROWS = 192  # of a panorama
 EYES = (40, 12, 12)  # points at most that are looked from, in rounds; later ones are those walked to after those before
 PLACES = 3000  # at most, that are walked to
 OPAQUE = 0.5  # alpha of pixels that show a surface
+HARDER = 2.0  # opacities times this show: behind the thin surfaces of fits the depth is that of what shines through
 KEPT = 0.5  # cells whose middle lies less than this many cells before a surface are kept: they reach into it
 FAR_M, SMOOTH = (
     8.0,
@@ -27,13 +28,16 @@ FAR_M, SMOOTH = (
 
 def carved(place: Occupancy, gaussians: Gaussians, eyes: torch.Tensor, body: Walker) -> Occupancy:
     """The grid of Gaussians without the solid cells that lie before surfaces seen from `eyes` [E, 3], points in free space, and
-    from where one can walk to from the first. The height of what is solid is that of the surfaces seen."""
+    from where one can walk to from the first. The height of what is solid is that of the surfaces seen. Gaussians are drawn as if
+    they were harder."""
     rng, filled, first = np.random.default_rng(0), place.solid, eyes[:1]
+    some = gaussians.at(gaussians.opacities > SOLID)
+    hard = replace(some, opacities=(HARDER * some.opacities).clamp_max(0.99))
     free = torch.zeros_like(filled)
     hits, height = torch.zeros(filled.numel()), torch.zeros(filled.numel())
     for count in EYES:
         for eye in spread_out(eyes, count, rng):
-            free |= _look(place, filled, gaussians, eye, hits, height)
+            free |= _look(place, filled, hard, eye, hits, height)
         place = replace(place, solid=filled & ~free)
         walked = floored(place, first[0], body, math.inf)
         eyes = torch.cat([first, walkable(walked, standing(place, first[0], body)[None], body, PLACES)])

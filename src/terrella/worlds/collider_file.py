@@ -19,7 +19,7 @@ COLLIDER_FILE, EDITED_FILE = (
     "world.collider.safetensors",
     "world.edited-collider.safetensors",
 )  # without and after its edits
-VERSION = 3  # changes with what `enclosed` computes
+VERSION = 4  # changes with what `enclosed` computes
 
 
 def kept_collider(
