@@ -45,9 +45,8 @@ class PostTraining:
 class DistilConfig(PostTraining):
     """Settings of a distillation."""
 
-    flow_steps: int | None = (
-        None  # Flow steps in which the student draws a frame. Default: 1, and without depth the teacher's.
-    )
+    # Flow steps in which the student draws a frame. Default: 1, and without depth the teacher's.
+    flow_steps: int | None = None
     # Training steps. Default: 2000, and without depth as in `train video`.
     steps: int | None = None
     hours: float | None = None  # Hours of training, earlier runs included.
