@@ -331,7 +331,7 @@ class _Learning:
         spec = make()[0].spec
         layout = replace(Layout.of(spec), pictures=storage_of(spec))
         job = replace(Job.of(make, spec, make_rng(config.seed + 1), layout), steps=facts["longest"])
-        self.progress(f"{workers} processes record up to {lacking:,} frames more while it trains (--workers).")
+        self.progress(f"While it trains, up to {lacking:,} frames more are recorded; processes: {workers} (--workers).")
         return recording_meanwhile(job, out, workers, lacking)
 
     @property
