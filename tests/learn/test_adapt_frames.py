@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from terrella.learn.recipes.adapt import AdaptConfig, adapt
 from terrella.learn.recipes.adapt_frames import _fitting, frame_errors
 from terrella.learn.recipes.video import train_video
 from terrella.learn.recipes.video_config import TrainConfig
-from terrella.learn.rehearsal import joined
+from terrella.learn.rehearsal import Rehearsal, joined
 from terrella.worlds.folder import load_world
 
 from ..data.layouts import layout_of
@@ -103,3 +105,12 @@ def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
 def test_rows_of_two_recordings_take_turns():
     one, other = (FlowClips(torch.full((2, 3), value), torch.full((2, 1), value), None) for value in (0, 1))
     assert joined(one, other, interleaved=True).frames[:, 0].tolist() == [0, 1, 0, 1]
+
+
+def test_every_second_batch_rehearses():
+    def same(value: int) -> Any:
+        return SimpleNamespace(batch=lambda now: FlowClips(torch.full((2, 3), value), torch.full((2, 1), value), None))
+
+    rehearsal: Any = Rehearsal(same(0), same(1), interleaved=True, every=2)
+    rows = [rehearsal.batch(SimpleNamespace(step=step)).frames[:, 0].tolist() for step in (1, 2, 3)]
+    assert rows == [[0, 0, 0, 0], [0, 1, 0, 1], [0, 0, 0, 0]]

@@ -87,8 +87,8 @@ def adapt(
         name: A latent world, or one of frames alone: a run of `train latent` or `train video`, or its folder.
         data: A recording of the other body or camera, with the same channels and as many actions.
         out: Folder of the run; the adapted world is in OUT/world.
-        keep: A recording that the world was trained on. Half of each batch is of it, so that less is forgotten, and how much is
-            forgotten is measured.
+        keep: A recording that the world was trained on. Half of the clips are of it (of frames a quarter), so that less
+            is forgotten, and how much is forgotten is measured.
     """
     result = adapt_world(name, data, out, config, keep=keep, progress=say)
     show(result, json, _practising(out, data) if result.facts["latent"] else _playing(out))

@@ -16,13 +16,15 @@ Clips = TypeVar("Clips")
 
 class Rehearsal:
     """Each batch is one of `new` and one of `kept`, joined: instances of one dataclass of tensors. interleaved: their rows in
-    turn, for objectives that treat the first rows of a batch otherwise."""
+    turn, for objectives that treat the first rows of a batch otherwise. every: one batch in `every` has rows of `kept`, the
+    others two of `new`."""
 
-    def __init__(self, new: Feed, kept: Feed, interleaved: bool = False):
-        self.new, self.kept, self.interleaved = new, kept, interleaved
+    def __init__(self, new: Feed, kept: Feed, interleaved: bool = False, every: int = 1):
+        self.new, self.kept, self.interleaved, self.every = new, kept, interleaved, every
 
     def batch(self, now: TrainStep) -> object:
-        return joined(self.new.batch(now), self.kept.batch(now), self.interleaved)
+        other = self.new if now.step % self.every else self.kept
+        return joined(self.new.batch(now), other.batch(now), self.interleaved)
 
     def state(self) -> dict:
         return {"new": self.new.state(), "kept": self.kept.state()}

@@ -30,7 +30,7 @@ class AdaptConfig:
     steps: int | None = None
     # Peak learning rate. Default: 5e-4, of a world that draws frames 3e-3.
     learning_rate: float | None = None
-    # Clips per step; with --keep half of them are of that recording. Default: 128, with pictures 32, of frames 8, on a GPU 64.
+    # Clips per step, those of --keep included. Default: 128, with pictures 32, of frames 8, on a GPU 64.
     batch: int | None = None
     # --no-laws: leave the laws of physics out of the loss. They are a part of it where the recording describes its bodies.
     laws: bool = True
@@ -42,10 +42,10 @@ def adapt(
     world: World, data: str | Path, out: str | Path, config: AdaptConfig, report: Report, keep: str | Path | None = None
 ) -> dict:
     """Trains, or resumes, a copy of a latent world, or of a world of frames alone, on the recording `data`; `out`/world is the
-    result. keep: a recording of what it learned before, of which half of each batch is made. Returns facts, the verdict first;
-    `errors` has, of each recording, the world's open-loop error on held-out episodes by step, before and after, as a share of
-    copy-last's: of latents, or the squared error of frames. TrainingError for a world that cannot go on learning; DatasetError for
-    a recording with other channels or actions."""
+    result. keep: a recording of what it learned before, of which half of the clips are, of frames a quarter. Returns facts, the
+    verdict first; `errors` has, of each recording, the world's open-loop error on held-out episodes by step, before and after, as a
+    share of copy-last's: of latents, or the squared error of frames. TrainingError for a world that cannot go on learning;
+    DatasetError for a recording with other channels or actions."""
     rate, counts = config.learning_rate, [one for one in (config.steps, config.batch) if one is not None]
     if config.minutes <= 0 or min(counts, default=1) < 1 or (rate is not None and rate <= 0):
         raise TrainingError("--minutes and --learning-rate are more than 0, and --steps and --batch 1 or more.")

@@ -194,7 +194,7 @@ class FlowRecipe:
         kept, moves = self.begin.kept, self.objective.generator.moves.cpu()
         stitched = stitch_episodes(kept, moves, self.over) if len(moves) > 1 else None
         streams = self._clips(self.parts.recording, self.stitched, batch), self._clips(kept, stitched, batch)
-        return Rehearsal(*streams, interleaved=True)
+        return Rehearsal(*streams, interleaved=True, every=2)
 
     def _clips(self, recording: Recording, stitched: StitchedEpisodes | None, batch: int) -> Feed:
         slots, seed = self.video.slots, self.parts.config.seed
