@@ -231,7 +231,7 @@ def trained(row: Row, settings: Settings) -> Row:
 def robot(row: Row, settings: Settings) -> Row:
     """Steps of 5 ms a second of go1 with random actions, observed; on a card by mujoco-warp."""
     if absent := [
-        name for name in ("mujoco", *(() if settings.cpu else ("mujoco_warp", "warp"))) if not find_spec(name)
+        name for name in ("mujoco", "mjlab", *(() if settings.cpu else ("mujoco_warp", "warp"))) if not find_spec(name)
     ]:
         row.error = f"not measured, without {', '.join(absent)}"
         return row
