@@ -19,6 +19,7 @@ from terrella.learn.moves import stitch_episodes
 from terrella.learn.objectives.flow_frames import DRAFTS, FlowFrames
 from terrella.learn.recipes.video_flat import FlowRecipe
 from terrella.learn.trainer import Run, Trainer
+from terrella.space.recall import EMPTY, KEPT, keys_of
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 
 OVER, SLOTS, ROLLOUT = torch.zeros(SIZE, dtype=torch.bool), 4, 4
@@ -42,6 +43,14 @@ def test_clips_are_rows_of_the_recording_that_follow_each_other(recording):  # n
     assert lone < 20, "some begin with one frame repeated"
     other = clips.batch(step(number=1))
     assert not torch.equal(other.frames, batch.frames) and torch.equal(clips.batch(step()).frames, batch.frames)
+
+
+def test_frames_before_the_clips_may_be_recalled(recording):  # noqa: F811
+    batch = DeviceClips(recording, SLOTS, ROLLOUT, torch.device("cpu"), recalls=True).sized(40).batch(step())
+    assert batch.kept is not None and batch.kept_keys is not None and batch.kept.shape == (40, KEPT, 3, *SIZE)
+    some = batch.kept_keys[:, 0, 0] < EMPTY
+    assert 0.3 < some.float().mean() < 0.9
+    torch.testing.assert_close(batch.kept_keys[some], keys_of(batch.kept[some] / 255))
 
 
 def test_the_memory_is_that_of_the_host(recording):  # noqa: F811

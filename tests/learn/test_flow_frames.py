@@ -16,12 +16,23 @@ from terrella.core import check_world, make_rng
 from terrella.core.errors import TrainingError
 from terrella.data import Recorder
 from terrella.learn.moves import Scrolling, stitch_episodes
-from terrella.learn.objectives.flow_frames import BLIND, DRAFTS, WHOLE, FlowClipMaker, FlowClips, FlowFrames
+from terrella.learn.objectives.flow_frames import (
+    BLIND,
+    DRAFTS,
+    PAST,
+    WHOLE,
+    EarlierFrames,
+    FlowClipMaker,
+    FlowClips,
+    FlowFrames,
+)
 from terrella.learn.recipes.student import student_settings, train_student
 from terrella.learn.recipes.video import train_video
+from terrella.learn.recipes.video_flat import comes_back
 from terrella.learn.recording import Recording
 from terrella.learn.subcloning import subclone
 from terrella.learn.train_step import TrainStep
+from terrella.space.recall import EMPTY, KEPT
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.folder import load_world
@@ -78,6 +89,31 @@ def test_some_clips_see_no_memory_some_all_and_some_what_the_last_frame_showed(r
     assert abs(shares[0] - BLIND) < 0.2 and abs(shares[1] - WHOLE) < 0.2 and sum(shares) < 1
     part = made.memory[(seen > 0) & (seen < 0.9), 0, 3]
     assert not part[..., -2:].any() and (part[:, 2:, :-2] > 0).all(), "the two columns that enter are new"
+
+
+def test_frames_of_the_same_episode_before_the_clip_may_be_recalled():
+    start = np.repeat([0, 40], [40, 300])
+    past = EarlierFrames(
+        torch.from_numpy(start), lambda rows: (rows % 256).to(torch.uint8)[:, None, None, None].expand(-1, 3, 8, 8)
+    )
+    draw = torch.linspace(0, 0.999, KEPT + 1).expand(4, -1).clone()
+    draw[3, KEPT] = 0
+    frames, keys = past.before(torch.tensor([0, 30, 250, 250]), draw)
+    rows = frames[:, :, 0, 0, 0]
+    assert (keys[[0, 3]] == EMPTY).all(), "nothing comes before an episode's first row, and some clips see nothing"
+    assert rows[1].min() == 0 and rows[1].max() == 28 and rows[2].min() == 250 - PAST and rows[2].max() == 244
+    torch.testing.assert_close(keys[1, :, 0], rows[1] / 255)
+
+
+def test_pictures_come_back_where_they_change_as_a_whole(recording, tmp_path):
+    """The recording scrolls by two pixels a step; in the other one a dot moves."""
+    with Recorder(tmp_path / "set", layout_of(10.0, ("right",), rgb=SIZE)) as recorder:
+        for row in range(90):
+            picture = np.zeros((*SIZE, 3), np.uint8)
+            picture[4:8, row % 28 : row % 28 + 4] = 255
+            recorder.add({"rgb": picture}, np.array([True]) if row < 89 else None, 0.0, False)
+        recorder.end_episode()
+    assert comes_back(recording, 0) and not comes_back(Recording.open(tmp_path / "set", SIZE, quiet), 0)
 
 
 def test_a_moving_paddle_does_not_scroll_the_picture(recording, tmp_path):

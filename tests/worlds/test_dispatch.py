@@ -22,12 +22,14 @@ from terrella.worlds.latent_network import LatentConfig, LatentNetwork
 from terrella.worlds.learned import About, LearnedWorld
 
 
-def flow(moves: int) -> LearnedWorld:
+def flow(moves: int, recalls: bool = False) -> LearnedWorld:
     """A world of frames alone, 64 x 64, whose pictures scroll by as many moves."""
     size, slots, actions = (64, 64), 4, 4
-    network = FlowNetwork(FlowConfig(size, slots, 36 + slots * actions, moves))
+    network = FlowNetwork(FlowConfig(size, slots, 36 + slots * actions, moves, recalls=recalls))
     network.moves[:, 0] = torch.arange(moves + 1)
-    settings = HistoryConfig(size, slots, actions, tuple(map(tuple, network.moves.tolist())) if moves else ())
+    settings = HistoryConfig(
+        size, slots, actions, tuple(map(tuple, network.moves.tolist())) if moves else (), recalls=recalls
+    )
     starts = StartClips.of(torch.zeros(2, slots, 3, *size, dtype=torch.uint8), actions)
     return LearnedWorld(
         About("flow", Controls.buttons(actions), 0.1), scene=FrameHistory(settings, starts), generator=network
@@ -49,6 +51,7 @@ WORLDS = {
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 1434),
     "flow": (lambda: flow(0), 285),
     "flow that scrolls": (lambda: flow(15), 384),
+    "flow that recalls": (lambda: flow(0, recalls=True), 320),
     "islet": (lambda: terrella.load("islet"), 500),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),

@@ -13,6 +13,7 @@ from terrella.core.errors import CheckpointError
 from terrella.data import Layout
 from terrella.space.ground import window
 from terrella.space.mosaic import empty_mosaic, read_mosaic, update_mosaic
+from terrella.space.recall import EMPTY, KEPT
 from terrella.worlds.config import HistoryConfig
 from terrella.worlds.controls import Controls
 from terrella.worlds.flow import RECALLED, STAYS, FlowConfig, FlowNetwork
@@ -25,9 +26,13 @@ SIZE, SLOTS = (20, 28), 3  # sides that are no multiples of 16
 MOVES = torch.tensor([[0, 0], [2, 0], [0, -3]])
 
 
-def network(wild: bool = True, moves: int = 2, seed: int = 0) -> FlowNetwork:
+def network(wild: bool = True, moves: int = 2, seed: int = 0, recalls: bool = False) -> FlowNetwork:
     torch.manual_seed(seed)
-    made = FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + 2 * SLOTS, moves, (8, 16, 16))).eval().requires_grad_(False)
+    made = (
+        FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + 2 * SLOTS, moves, (8, 16, 16), recalls=recalls))
+        .eval()
+        .requires_grad_(False)
+    )
     made.moves[:] = MOVES[: moves + 1]
     if wild:
         torch.nn.init.normal_(made.output.weight, std=0.3)
@@ -55,13 +60,39 @@ def world(generator: FlowNetwork, ground: torch.Tensor | None = None) -> Learned
         frames = torch.stack([ground[:3, y : y + SIZE[0], x : x + SIZE[1]] for x, y in [(0, 0), (12, 6), (30, 18)]])
         starts = StartClips.of(frames[:, None].repeat(1, SLOTS, 1, 1, 1), 2)
     moves = tuple(map(tuple, generator.moves.tolist())) if generator.config.moves else ()
-    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2, moves), starts, None, ground)
+    scene = FrameHistory(HistoryConfig(SIZE, SLOTS, 2, moves, recalls=generator.config.recalls), starts, None, ground)
     return LearnedWorld(About("made", Controls.buttons(2), 0.1), scene=scene, generator=generator)
 
 
-@pytest.mark.parametrize("moves", [0, 2])
-def test_it_keeps_the_contract(moves):
-    assert {"batches", "states_can_be_saved"} <= set(check_world(world(network(moves=moves)), steps=3))
+@pytest.mark.parametrize(("moves", "recalls"), [(0, False), (2, False), (0, True)])
+def test_it_keeps_the_contract(moves, recalls):
+    made = world(network(moves=moves, recalls=recalls))
+    assert {"batches", "states_can_be_saved"} <= set(check_world(made, steps=3))
+
+
+def test_a_frame_of_long_ago_changes_what_is_drawn_where_it_is_like_the_draft():
+    """With one drawing step there is only the draft, which sees no memory."""
+    made, rng = world(network(moves=0, recalls=True)), make_rng(0)
+    seen = pictures(1, 8, seed=3)[0].permute(0, 2, 3, 1)
+    action = torch.zeros(1, 2)
+    state = made.observe({"rgb": seen[:1]}, None, rng)
+    for picture in seen[1:]:
+        state = made.observe({"rgb": picture[None]}, made.imagine(state, action, rng), rng)
+    kept = state["kept"][0]
+    assert torch.equal(kept[: 8 - SLOTS], seen[: 8 - SLOTS].flip(0).permute(0, 3, 1, 2)), "those that left the history"
+    empty = state.replace(kept_keys=torch.full_like(state["kept_keys"], EMPTY))
+    for steps, same in [(3, False), (1, True)]:
+        drawer = made.replaced(steps=steps)
+        one, other = (drawer.render(drawer.imagine(at, action, make_rng(1)), ("rgb",))["rgb"] for at in (state, empty))
+        assert torch.equal(one, other) == same
+
+
+def test_a_world_that_recalls_is_saved_and_read(tmp_path):
+    made = world(network(moves=0, recalls=True))
+    save_world(made, tmp_path)
+    read = load_world(tmp_path)
+    assert read.scene.config.recalls and read.generator.config.recalls
+    assert read.start(1, make_rng(0))["kept"].shape == (1, KEPT, 3, *SIZE)
 
 
 def test_untrained_the_last_frame_stays_to_the_last_bit():

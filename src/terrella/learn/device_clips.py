@@ -9,8 +9,9 @@ import numpy as np
 import torch
 
 from ..core.errors import DatasetError
+from ..space.recall import KEPT
 from .moves import StitchedEpisodes
-from .objectives.flow_frames import CHANGED, LONE, FlowClips, memory_shown, preference
+from .objectives.flow_frames import CHANGED, LONE, EarlierFrames, FlowClips, memory_shown, preference
 from .recording import Recording
 from .train_step import TrainStep
 
@@ -35,6 +36,7 @@ class DeviceClips:
         rollout: int,
         device: torch.device,
         grounds: DeviceGrounds | None = None,
+        recalls: bool = False,
     ):
         self.slots, self.size, self.grounds = slots, 1, grounds
         shape = recording.cache.rgb.shape
@@ -50,6 +52,8 @@ class DeviceClips:
         if not len(rows):
             raise DatasetError(f"no episode has the {slots + rollout} rows that a clip has; record longer ones.")
         self.rows = torch.from_numpy(rows).to(device)
+        start = torch.from_numpy(recording.start).to(device)
+        self.past = EarlierFrames(start, self.frames.__getitem__) if recalls else None
         self.window = torch.arange(1 - slots, rollout + 1, device=device)
         weight = preference(changes[self.rows[:, None] + self.window[slots:]].amax(1))
         self.upto = (weight / weight.sum()).cumsum(0)
@@ -69,7 +73,8 @@ class DeviceClips:
         actions = actions.masked_fill(lone[..., None], 0)
         grounds = self.grounds
         memory = None if grounds is None else grounds.memory(rows[:, self.slots :], now.rand(self.size))
-        return FlowClips(frames, actions, memory)
+        kept = () if self.past is None else self.past.before(rows[:, 0], now.rand(self.size, KEPT + 1))
+        return FlowClips(frames, actions, memory, *kept)
 
     def state(self) -> dict:
         return {}

@@ -54,6 +54,7 @@ class HistoryConfig:
     actions: int  # numbers of an encoded action
     moves: tuple[tuple[int, int], ...] = ()  # x and y in pixels by which pictures scroll, (0, 0) first; none: no mosaic
     cameras: tuple[str, ...] = ()  # picture channels that lie side by side in a frame, from the left; (): rgb alone
+    recalls: bool = False  # earlier frames are kept, and one is recalled (space/recall.py)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ A U-Net in two halves. The first sees the last frames and the actions, once a fr
 sees its features, the noisy frame x_t and what memory knows of the picture. The network predicts the clean frame x_1 from
 x_t = (1 - t) noise + t x_1 (x-prediction). Its first step, t = 0, needs no noise: the draft is the mean of all that may follow.
 Where pictures scroll, it draws the change of the last frame carried along (global motion compensation), and a mosaic remembers
-what left the picture. Where several cameras overlap, their pictures are made to agree.
+what left the picture. Where pictures change as a whole, the steps after the draft see the earlier frame that is most like it.
+Where several cameras overlap, their pictures are made to agree.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from torch import nn
 from ..core.backend import constant, plus
 from ..space.mosaic import displaced, read_mosaic
 from ..space.overlap import Blend, MountedCamera
+from ..space.recall import most_alike
 from .generator import Conditioning, encode_depth, parts_of
 from .scroll import Scroll, predicted_scroll
 
@@ -43,6 +45,7 @@ class FlowConfig:
     moves: int = 0  # displacements by which pictures scroll, beside (0, 0); 0: no memory either
     channels: tuple[int, ...] = (64, 112, 160)  # at 1/4, 1/8 and 1/16 of the size
     steps: int = 3  # drawing steps a frame, the draft included
+    recalls: bool = False  # it sees an earlier frame that is like the draft
     views: tuple[MountedCamera, ...] = ()  # cameras whose pictures lie side by side in a frame, from the left; (): one
 
 
@@ -99,6 +102,7 @@ class FlowNetwork(nn.Module):
         super().__init__()
         self.config = config
         fine, middle, coarse = config.channels
+        remembers = config.moves > 0 or config.recalls
         self.register_buffer("moves", torch.zeros(config.moves + 1, 2, dtype=torch.int64))
         self.register_buffer("over", torch.zeros(config.size, dtype=torch.bool))
         self.scrolling = Scroll(config.size, config.slots, config.context, config.moves) if config.moves else None
@@ -107,7 +111,7 @@ class FlowNetwork(nn.Module):
         self.actions = nn.Sequential(nn.Linear(config.context, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE), nn.SiLU())
         self.time = nn.Sequential(nn.Linear(2 * FREQUENCIES, WIDE), nn.SiLU(), nn.Linear(WIDE, WIDE))
         self.enter = nn.Conv2d(3 * config.slots, fine, SQUARE, stride=SQUARE)
-        self.enter_drawn = nn.Conv2d(6 + 4 * (config.moves > 0), fine, SQUARE, stride=SQUARE)
+        self.enter_drawn = nn.Conv2d(6 + 4 * remembers, fine, SQUARE, stride=SQUARE)
         self.before = nn.ModuleList(AdaptiveBlock(width) for width in config.channels)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in ((fine, middle), (middle, coarse)))
         self.attention = nn.MultiheadAttention(coarse, HEADS, batch_first=True)
@@ -116,7 +120,7 @@ class FlowNetwork(nn.Module):
         self.after = nn.ModuleList(AdaptiveBlock(width) for width in (coarse, middle, fine, fine))
         self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in ((middle, coarse), (fine, middle)))
         self.detail = nn.Conv2d(fine, DETAIL * SQUARE**2, 1)
-        self.near = nn.Conv2d(DETAIL + 9, 24, 3, padding=1)
+        self.near = nn.Conv2d(DETAIL + 9 + 4 * config.recalls, 24, 3, padding=1)
         self.output = nn.Conv2d(24, 3, 3, padding=1)
         nn.init.zeros_(self.output.weight)  # untrained, the last frame stays
         self.output.bias = nn.Parameter(torch.zeros(3))
@@ -139,7 +143,7 @@ class FlowNetwork(nn.Module):
         tokens = coarse.flatten(2).transpose(1, 2)
         coarse = coarse + self._attended(tokens).transpose(1, 2).unflatten(2, coarse.shape[-2:])
         base = frames[:, 0] if scroll is None else carry(frames[:, 0], scroll, self.moves, self.over, memory)
-        remembered = self._remembered(memory, base) if self.config.moves else None
+        remembered = self._remembered(memory, base) if self.config.moves or self.config.recalls else None
         older = frames[:, min(1, frames.shape[1] - 1)]
         return FlowFeatures((fine, middle, coarse), embedding, base, older, remembered)
 
@@ -168,7 +172,8 @@ class FlowNetwork(nn.Module):
         x = after[3].modulated(x, by[4])
         height, width = self.config.size
         detail = F.pixel_shuffle(self.detail(x), SQUARE)[..., :height, :width]
-        near = self.near(torch.cat([detail, change, base, older], 1))
+        recalled = [remembered] if self.config.recalls and remembered is not None else []
+        near = self.near(torch.cat([detail, change, base, older, *recalled], 1))
         return base + self.output(F.silu(near)).float()
 
     def draw(self, noise: torch.Tensor, conditioning: Conditioning, steps: int | None = None) -> torch.Tensor:
@@ -181,19 +186,30 @@ class FlowNetwork(nn.Module):
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]).masked_fill(self.over, 0)
         rgb = plus(-1.0, conditioning.glimpse.rgb, 2)
-        x = self.sample(rgb, conditioning.context, scroll, memory, noise[:, :3], steps)
+        given = conditioning.context, scroll, memory, noise[:, :3], steps, conditioning.kept, conditioning.kept_keys
+        x = self.sample(rgb, *given)
         return torch.cat([x, constant(_no_depth, x.device, *self.config.size).expand(len(x), -1, -1, -1)], 1)
 
-    def sample(self, frames, context, scroll, memory, noise: torch.Tensor, steps: int) -> torch.Tensor:
-        """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. The rest: as in `encode`."""
+    def recalling(
+        self, seen: FlowFeatures, kept: torch.Tensor, keys: torch.Tensor, draft: torch.Tensor
+    ) -> FlowFeatures:
+        """The features with the kept frame that is most like the draft [B, 3, H, W] as memory."""
+        return seen._replace(remembered=self._remembered(most_alike(kept, keys, draft), seen.base))
+
+    def sample(self, frames, context, scroll, memory, noise: torch.Tensor, steps: int, kept=None, kept_keys=None):
+        """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. kept uint8
+        [B, K, 3, H, W], kept_keys [B, K, n]: earlier frames (space/recall.py). The rest: as in `encode`."""
         seen = self.encode(frames, context, scroll, memory)
         agreed = self.blend or (lambda x: x)  # after each step, as in MultiDiffusion (Bar-Tal et al. 2023)
         noise = noise if self.blend is None else self.blend.noise(noise)
-        times = self.time(constant(_waves_of_steps, noise.device, steps))
+        when = times_of(steps, self.config.recalls)
+        times = self.time(constant(_waves_of_times, noise.device, when))
         whole = modulations(self._drawing, seen.embedding[:, None] + times)  # of all steps
         x = seen.base
-        for step in range(steps):
-            noisy = torch.lerp(noise, x.clamp(-1, 1), step / steps) if step else x
+        for step, time in enumerate(when):
+            if step == 1 and kept is not None and kept_keys is not None:
+                seen = self.recalling(seen, kept, kept_keys, x)
+            noisy = torch.lerp(noise, x.clamp(-1, 1), time) if time else seen.base
             x = agreed(self._cleaned(seen, noisy, [(scale[:, step], shift[:, step]) for scale, shift in whole]))
         x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
         if memory is not None:
@@ -237,8 +253,14 @@ def _waves(time: torch.Tensor) -> torch.Tensor:
     return torch.cat([angle.sin(), angle.cos()], 1)
 
 
-def _waves_of_steps(steps: int) -> torch.Tensor:
-    return _waves(torch.arange(steps) / steps)
+def times_of(steps: int, recalls: bool) -> tuple[float, ...]:
+    """Flow times of drawing steps. With a frame that is recalled by the draft, the next step is a draft again, which sees it."""
+    again = steps - 1 if recalls and steps > 1 else steps
+    return (0.0,) * (steps - again) + tuple(step / again for step in range(again))
+
+
+def _waves_of_times(times: tuple[float, ...]) -> torch.Tensor:
+    return _waves(torch.tensor(times))
 
 
 def _no_depth(height: int, width: int) -> torch.Tensor:

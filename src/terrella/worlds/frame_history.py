@@ -1,7 +1,7 @@
 """FrameHistory: the scene of a frames-only world, for recordings without depth or pose.
 
 The last frames and actions take the place of keyframes. Where pictures scroll, a mosaic remembers what left the picture, and the
-ground of the recordings is known where a picture is recognised on it.
+ground of the recordings is known where a picture is recognised on it. Where they change as a whole, earlier frames are kept.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from ..space.ground import ALIKE, NOWHERE, locate, window
 from ..space.keyframes import Glimpse, Keyframes
 from ..space.matching import scroll_index
 from ..space.mosaic import PICTURES, empty_mosaic, middle, update_mosaic, write_mosaic
+from ..space.recall import keep, nothing_kept
 from .config import HistoryConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .parts import STARTS, Channels, Evidence, Tensors, Walls, check_prior, newest_frame, picture_of
@@ -70,7 +71,7 @@ class FrameHistory:
         self.moves = torch.tensor(config.moves, dtype=torch.int64, device=self.device).view(-1, 2)
         self.ground = torch.zeros(4, 1, 1, dtype=torch.uint8, device=self.device) if ground is None else ground
         self.grounded = bool(config.moves) and self.ground[0].numel() > 1
-        flat = ("mosaic", "scroll") * bool(config.moves)
+        flat = ("mosaic", "scroll") * bool(config.moves) + ("kept", "kept_keys") * config.recalls
         self.drawn_names: tuple[str, ...] = ("frames", *flat, *("place",) * self.grounded)
         nothing = torch.zeros(0, 3, *config.size, dtype=torch.uint8), torch.zeros(0, *config.size), torch.zeros(0, 7)
         self.recorded = Keyframes.of(*nothing, (1.0, 1.0, 0.5, 0.5))
@@ -122,6 +123,8 @@ class FrameHistory:
         """With the frames of the evidence, the mosaic as of the frame before, and how the newest scrolled."""
         frames = evidence.seen["frames"]
         seen = {"frames": frames}
+        if self.config.recalls and prior is None:
+            seen["kept"], seen["kept_keys"] = nothing_kept(evidence.batch, self.config.size, self.device)
         if self.config.moves:
             if "mosaic" in evidence.seen:
                 seen["mosaic"] = evidence.seen["mosaic"]
@@ -158,14 +161,17 @@ class FrameHistory:
         last = constant(torch.zeros, frames.device, 1, 4, *self.config.size).expand(len(frames), -1, -1, -1)
         familiar = constant(torch.zeros, self.device, 1, 2).expand(state.batch, -1)
         mosaic = self._joined(state) if self.config.moves else None
-        return Conditioning(glimpse_of_frames(frames), last, context, familiar, mosaic)
+        kept = (state["kept"], state["kept_keys"]) if self.config.recalls else (None, None)
+        return Conditioning(glimpse_of_frames(frames), last, context, familiar, mosaic, None, *kept)
 
     def take(self, state: State, conditioning: Conditioning, frame: DrawnFrame) -> State:
-        """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic."""
+        """With the frame as its newest, the move by which it scrolled, and the last frame in its mosaic; the oldest is kept."""
         mosaic, scroll = conditioning.mosaic, conditioning.scroll
         flat = {} if mosaic is None or scroll is None else {"mosaic": mosaic, "scroll": scroll}
         if self.grounded and scroll is not None:
             flat["place"] = state["place"] - self.moves[scroll]
+        if conditioning.kept is not None and conditioning.kept_keys is not None:
+            flat["kept"], flat["kept_keys"] = keep(conditioning.kept, conditioning.kept_keys, state["frames"][:, -1])
         return state.replace(frames=torch.cat([frame.rgb[:, None], state["frames"][:, :-1]], 1), **flat)
 
     def _joined(self, state: State) -> torch.Tensor:

@@ -29,7 +29,7 @@ class Conditioning:
     trust; where things move [B, 4 + PLANES, H, W] (carried_frames.py). context [B, n]: thumbnail of the last frame, in some
     worlds also the last actions. familiar [B, 2]: how well the place is known, for the uncertainty (keyframe_scene.py).
     Of a flat world: mosaic uint8 [B, 4, H', W'] (space/mosaic.py); scroll int64 [B], by which of the generator's moves most of
-    the picture goes on.
+    the picture goes on; kept uint8 [B, K, 3, H, W] and kept_keys [B, K, n] (space/recall.py), earlier frames.
     """
 
     glimpse: Glimpse
@@ -38,6 +38,8 @@ class Conditioning:
     familiar: torch.Tensor | None = None
     mosaic: torch.Tensor | None = None
     scroll: torch.Tensor | None = None
+    kept: torch.Tensor | None = None
+    kept_keys: torch.Tensor | None = None
 
     def to(self, device) -> Conditioning:
         return self._each(lambda part: part.to(device))

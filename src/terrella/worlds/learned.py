@@ -117,7 +117,8 @@ class LearnedWorld:
         """The settings of all parts in one."""
         drawn, posed = self.generator.config, self.scene.camera is not None
         settings: dict[str, Any] = {"camera": (1.0, 1.0, 0.5, 0.5), **vars(self.scene.config)}
-        settings.pop("moves", None)  # found in the recording
+        for name in ("moves", "recalls"):  # found in the recording
+            settings.pop(name, None)
         settings |= {"channels": drawn.channels, "steps": drawn.steps, "residual": getattr(drawn, "residual", False)}
         if self.body:
             settings |= {name: getattr(self.body.config, name) for name in ("history", "body_m", "short")}

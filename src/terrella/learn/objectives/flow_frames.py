@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from ...space.matching import scroll_index
+from ...space.recall import EMPTY, KEPT, keys_of
 from ...worlds.controls import Controls
 from ...worlds.flow import FlowFeatures, FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
@@ -27,6 +28,7 @@ LATEST = 0.9  # the largest flow time in training
 BLIND, WHOLE = 0.4, 0.3
 RECORDED = 400  # gradient steps on recorded frames alone, before rollouts begin
 WARMUP = 300  # gradient steps
+PAST = 128  # rows before a clip of which frames may be recalled
 LONE = 0.1  # the part of clips whose history is one frame repeated: play begins so, too
 
 
@@ -34,11 +36,14 @@ LONE = 0.1  # the part of clips whose history is one frame repeated: play begins
 class FlowClips:
     """frames uint8 [B, slots + rollout, 3, H, W] and encoded actions [B, slots + rollout, A], action t leading from frame t to the
     next; the oldest first. memory uint8 [B, rollout, 4, H, W]: what is known of the frames after the history, colour and votes;
-    None in a world that does not scroll."""
+    None in a world that does not scroll. kept uint8 [B, K, 3, H, W] and kept_keys [B, K, n]: frames before the history; None in
+    a world that recalls none."""
 
     frames: torch.Tensor
     actions: torch.Tensor
     memory: torch.Tensor | None
+    kept: torch.Tensor | None = None
+    kept_keys: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class FlowClipMaker:
     batch: int
     stitched: StitchedEpisodes | None
     over: torch.Tensor
+    past: EarlierFrames | None = None
 
     def __call__(self, clips: Mapping[str, np.ndarray], now: TrainStep) -> FlowClips:
         """From clips (rgb uint8 [N, T, H, W, 3], action [N, T, ...], row [N, T])."""
@@ -64,7 +70,12 @@ class FlowClipMaker:
         lone = torch.from_numpy(now.rng.random(self.batch) < LONE)
         frames[lone, : self.slots - 1] = frames[lone, self.slots - 1 : self.slots]
         actions[lone, : self.slots - 1] = 0
-        return FlowClips(frames, actions, self._memory(np.asarray(clips["row"])[picks, self.slots :], now))
+        rows = np.asarray(clips["row"])[picks]
+        kept = ()
+        if self.past is not None:
+            draw = torch.from_numpy(now.rng.random((self.batch, KEPT + 1)))
+            kept = self.past.before(torch.from_numpy(rows[:, 0]), draw)
+        return FlowClips(frames, actions, self._memory(rows[:, self.slots :], now), *kept)
 
     def _memory(self, rows: np.ndarray, now: TrainStep) -> torch.Tensor | None:
         """Of rows [B, rollout]."""
@@ -74,6 +85,24 @@ class FlowClipMaker:
         known = self.stitched.memory(after.flatten(), size).unflatten(0, after.shape)
         kind = torch.from_numpy(now.rng.random(len(rows)))
         return known * memory_shown(self.stitched.place, after, self.over, kind)[:, :, None]
+
+
+@dataclass(frozen=True)
+class EarlierFrames:
+    """Frames of a recording that were seen before a clip. start int64 [N]: the first row of the episode of each row; read: rows
+    int64 [n] to frames uint8 [n, 3, H, W]."""
+
+    start: torch.Tensor
+    read: Callable[[torch.Tensor], torch.Tensor]
+
+    def before(self, first: torch.Tensor, draw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """KEPT frames of the same episode before the rows `first` int64 [B], up to PAST before, and their keys; of BLIND of the
+        clips none. draw [B, KEPT + 1]: uniform in 0..1."""
+        early = torch.maximum(self.start[first], first - PAST)
+        some = (first > early) & (draw[:, KEPT] >= BLIND)
+        rows = early[:, None] + (draw[:, :KEPT] * (first - early)[:, None]).long()
+        frames = self.read(rows.flatten()).unflatten(0, rows.shape)
+        return frames, torch.where(some[:, None, None], keys_of(frames / 255), EMPTY)
 
 
 def preference(changed):
@@ -129,6 +158,7 @@ class FlowFrames:
         slots = self.generator.config.slots
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown = recorded[:, :slots].flip(1)
+        kept = tuple(each.to(now.device) for each in (batch.kept, batch.kept_keys) if each is not None)
         half = len(recorded) // 2 * (now.step * self.losses_per_batch >= RECORDED)  # the other half stays recorded
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
@@ -137,12 +167,12 @@ class FlowFrames:
             scroll = None
             if self.generator.scrolling is not None:
                 scroll = scroll_index(shown[:, 0], truth, self.generator.moves)
-            yield self._loss(shown, context, memory, scroll, truth, before, now)
+            yield self._loss(shown, context, memory, scroll, kept, truth, before, now)
             count = half if step + 1 < recorded.shape[1] else 0
-            drawn = self._drawn(shown[:count], context, scroll, memory, now) if count else truth[:0]
+            drawn = self._drawn(shown[:count], context, scroll, memory, kept, now) if count else truth[:0]
             shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, context, memory, scroll, truth, before, now: TrainStep) -> Loss:
+    def _loss(self, shown, context, memory, scroll, kept, truth, before, now: TrainStep) -> Loss:
         """The loss of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
         batch, network = len(truth), self.generator
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
@@ -158,11 +188,15 @@ class FlowFrames:
         taught = self._taught(frames, context, scroll, memory, now)
         target = self._target(clean, taught, None, torch.zeros(batch, device=now.device), now)
         parts = {"draft": self._error(draft, target, base, changes)}
-        if now.share < DRAFTS:
+        samples = now.share >= DRAFTS
+        if not samples and not kept:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
+        if kept:  # at later times x_t shows more than memory does
+            seen, taught = (each and self.generator.recalling(each, *kept, draft.detach()) for each in (seen, taught))
+            t = t * (now.rand(batch) < 0.5 * samples)
         share = t[:, None, None, None]
-        noisy = (1 - share) * now.randn(*clean.shape) + share * clean
+        noisy = torch.where(share > 0, (1 - share) * now.randn(*clean.shape) + share * clean, seen.base)
         with now.half():
             drawn = self._clean(seen, noisy, t)
         parts["drawn"] = self._error(drawn, self._target(clean, taught, noisy, t, now), base, changes)
@@ -199,13 +233,22 @@ class FlowFrames:
             self.smooth.module.scrolling.load_state_dict(self.generator.scrolling.requires_grad_(False).state_dict())
 
     @torch.no_grad()
-    def _drawn(self, shown, context, scroll, memory, now: TrainStep) -> torch.Tensor:
+    def _drawn(self, shown, context, scroll, memory, kept, now: TrainStep) -> torch.Tensor:
         """Frames uint8 [B, 3, H, W] that follow the B histories `shown` by the true scroll, drawn by the averaged weights in 1 step
         or more."""
         network, batch = self.smooth.module, len(shown)
-        steps = 1 + int(now.rng.integers(network.config.steps)) * (now.share > DRAFTS)
+        most = network.config.steps if now.share > DRAFTS else 1 + network.config.recalls
+        steps = 1 + int(now.rng.integers(most))
         scroll, memory = (None if each is None else each[:batch] for each in (scroll, memory))
         noise = now.randn(batch, 3, *network.config.size)
         with now.half():
-            drawn = self._sample(shown.float() / 127.5 - 1, context[:batch], scroll, memory, noise, steps)
+            drawn = self._sample(
+                shown.float() / 127.5 - 1,
+                context[:batch],
+                scroll,
+                memory,
+                noise,
+                steps,
+                *(each[:batch] for each in kept),
+            )
         return pixels(drawn.float())

@@ -26,7 +26,7 @@ from ..devices import free_bytes
 from ..feeds import ClipStream, clips_of, fitting_rollout
 from ..growing_feed import GrowingFeed
 from ..moves import Scrolling, StitchedEpisodes, changed_pixels, mosaics, stitch_episodes
-from ..objectives.flow_frames import FlowClipMaker, FlowFrames
+from ..objectives.flow_frames import EarlierFrames, FlowClipMaker, FlowFrames
 from ..objectives.scroll import learn_scroll
 from ..presets import GIB, TrainingPlan
 from ..recording import Recording
@@ -41,6 +41,7 @@ from .video_parts import VideoParts
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
 QUARTER = 0.25
 FLOW_ROLLOUT = 8  # steps of a clip that a flow network predicts
+APART, WHOLE = 16, 0.3  # steps, and the share of pixels that differ where pictures change as a whole
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE = 0.4  # the pixels that change weigh this share of all others in the loss,
 MAX_STRESS = 16.0  # but each at most this much: with 128, long trainings get worse
@@ -120,8 +121,9 @@ class FlowRecipe:
         recording, plain, config = self.parts.recording, self.video.generator, self.parts.config
         scrolling = _scrolling_of(self.parts)
         steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
+        recalls = len(scrolling.moves) == 1 and comes_back(recording, config.seed)
         views = tuple(MountedCamera(lens.intrinsics, lens.mount) for lens in recording.lenses().values())
-        settings = FlowConfig(plain.size, plain.slots, plain.context, len(scrolling.moves) - 1, widths, steps)
+        settings = FlowConfig(plain.size, plain.slots, plain.context, len(scrolling.moves) - 1, widths, steps, recalls)
         mounted = len(views) == len(recording.cameras)  # it is known of each how it is mounted
         network = FlowNetwork(replace(settings, views=views) if mounted else settings)
         network.moves[:], network.over[:] = scrolling.moves, scrolling.over
@@ -146,7 +148,8 @@ class FlowRecipe:
             return None, f"{whole} takes more than half of {lacking}"
         try:
             grounds = None if self.stitched is None else DeviceGrounds(self.stitched, self.over, device)
-            held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
+            recalls = self.objective.generator.config.recalls
+            held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds, recalls)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
@@ -199,7 +202,10 @@ class FlowRecipe:
     def _clips(self, recording: Recording, stitched: StitchedEpisodes | None, batch: int) -> Feed:
         slots, seed = self.video.slots, self.parts.config.seed
         controls = recording.controls or Controls.buttons(self.video.actions)
-        maker = FlowClipMaker(controls, slots, batch, stitched, self.over)
+        past = None
+        if self.objective.generator.config.recalls:
+            past = EarlierFrames(torch.from_numpy(recording.start), lambda rows: recording.rgb(rows.numpy()))
+        maker = FlowClipMaker(controls, slots, batch, stitched, self.over, past)
         length = slots + self.objective.losses_per_batch
         return ClipStream(clips_of(recording, length, 3 * batch, self.video, seed), maker)
 
@@ -224,7 +230,12 @@ class FlowRecipe:
         whole = tuple((int(x), int(y)) for x, y in moves) if scrolls else ()
         return LearnedWorld(
             parts.about(trainer, (self.objective.generator,), 0),
-            scene=FrameHistory(replace(self.video.frames, moves=whole), self.starts, self.over, self.ground),
+            scene=FrameHistory(
+                replace(self.video.frames, moves=whole, recalls=self.objective.generator.config.recalls),
+                self.starts,
+                self.over,
+                self.ground,
+            ),
             generator=copy.deepcopy(self.objective.smooth.module).cpu().float(),
             outcome=parts.trained_outcome(ConstantConfig(parts.median_reward)),
         )
@@ -257,6 +268,16 @@ def _scrolling_of(parts: VideoParts) -> Scrolling:
         scrolling = Scrolling.of(parts.recording, config.seed, pixels)
         scrolling.write(run.out, run.recipe)
     return scrolling
+
+
+def comes_back(recording: Recording, seed: int) -> bool:
+    """Whether pictures change as a whole, so that earlier ones may come back: APART steps apart, WHOLE of the pixels
+    differ."""
+    rows = recording.rows_within(APART, 0)
+    if not len(rows):
+        return False
+    rows = np.random.default_rng(seed).choice(rows, min(len(rows), 500), replace=False)
+    return bool(changed_pixels(recording.rgb(rows - APART), recording.rgb(rows)).float().mean() > WHOLE)
 
 
 def stress_of(recording: Recording, network: FlowNetwork, seed: int) -> float:
