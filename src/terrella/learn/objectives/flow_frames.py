@@ -193,7 +193,8 @@ class FlowFrames:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
         if kept:  # at later times x_t shows more than memory does
-            seen, taught = (each and self.generator.recalling(each, *kept, draft.detach()) for each in (seen, taught))
+            seen = network.recalling(seen, *kept, draft.detach())
+            taught = None if taught is None else network.recalling(taught, *kept, draft.detach())
             t = t * (now.rand(batch) < 0.5 * samples)
         share = t[:, None, None, None]
         noisy = torch.where(share > 0, (1 - share) * now.randn(*clean.shape) + share * clean, seen.base)
