@@ -158,7 +158,9 @@ class FlowFrames:
         slots = self.generator.config.slots
         recorded, actions = batch.frames.to(now.device), batch.actions.to(now.device)
         shown = recorded[:, :slots].flip(1)
-        kept = tuple(each.to(now.device) for each in (batch.kept, batch.kept_keys) if each is not None)
+        kept = None
+        if batch.kept is not None and batch.kept_keys is not None:
+            kept = batch.kept.to(now.device), batch.kept_keys.to(now.device)
         half = len(recorded) // 2 * (now.step * self.losses_per_batch >= RECORDED)  # the other half stays recorded
         for step in range(slots, recorded.shape[1]):
             truth, before = recorded[:, step], recorded[:, step - 1]
@@ -189,12 +191,12 @@ class FlowFrames:
         target = self._target(clean, taught, None, torch.zeros(batch, device=now.device), now)
         parts = {"draft": self._error(draft, target, base, changes)}
         samples = now.share >= DRAFTS
-        if not samples and not kept:
+        if not samples and kept is None:
             return Loss("generator", parts["draft"], parts)
         t = LATEST * now.rand(batch)
-        if kept:  # at later times x_t shows more than memory does
-            seen = network.recalling(seen, *kept, draft.detach())
-            taught = None if taught is None else network.recalling(taught, *kept, draft.detach())
+        if kept is not None:  # at later times x_t shows more than memory does
+            seen = network.recalling(seen, kept[0], kept[1], draft.detach())
+            taught = None if taught is None else network.recalling(taught, kept[0], kept[1], draft.detach())
             t = t * (now.rand(batch) < 0.5 * samples)
         share = t[:, None, None, None]
         noisy = torch.where(share > 0, (1 - share) * now.randn(*clean.shape) + share * clean, seen.base)
@@ -250,6 +252,6 @@ class FlowFrames:
                 memory,
                 noise,
                 steps,
-                *(each[:batch] for each in kept),
+                *(each[:batch] for each in kept or ()),
             )
         return pixels(drawn.float())
