@@ -87,7 +87,9 @@ def test_a_training_step_on_a_device_waits_for_nothing_and_copies_nothing(record
 def test_a_recording_that_does_not_fit_stays_on_the_cpu_which_is_said(recording, monkeypatch):  # noqa: F811
     recipe, card = object.__new__(FlowRecipe), SimpleNamespace(device=torch.device("cuda"))
     recipe.parts = cast(Any, SimpleNamespace(run=card, recording=recording))
-    recipe.video, recipe.objective = cast(Any, SimpleNamespace(slots=2)), cast(Any, SimpleNamespace(losses_per_batch=1))
+    network = SimpleNamespace(config=SimpleNamespace(recalls=False))
+    recipe.objective = cast(Any, SimpleNamespace(losses_per_batch=1, generator=network))
+    recipe.video = cast(Any, SimpleNamespace(slots=2))
     recipe.begin = recipe.stitched = None
 
     def full(*given):
