@@ -152,6 +152,13 @@ def learned(share: float) -> list[float]:
     return losses
 
 
+def test_a_still_picture_costs_nothing_before_training_whatever_the_noise_on_its_history():
+    network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
+    still = torch.randint(0, 256, (8, 1, 3, 16, 16), dtype=torch.uint8, generator=make_rng(0)).expand(-1, 3, -1, -1, -1)
+    (loss,) = FlowFrames(network, 5e-3, 1, 4.0).losses(FlowClips(still, torch.zeros(8, 3, 1), None), step())
+    assert float(loss.value.detach()) == 0
+
+
 @pytest.mark.parametrize("share", [0.0, 0.9])
 def test_it_learns_what_moves(share):
     losses = learned(share)

@@ -271,3 +271,15 @@ def test_the_ground_of_the_recordings_is_known_from_every_start():
     assert mosaic is not None
     counts = (mosaic[:, 3] > 0).sum((1, 2))
     assert (counts == ground.shape[1] * ground.shape[2]).all(), "all of it lies in the mosaic"
+
+
+def test_noise_on_the_history_leaves_the_frame_that_changes():
+    generator, frames, context = (
+        network(moves=0),
+        pictures(2, SLOTS).float() / 127.5 - 1,
+        torch.zeros(2, 36 + 2 * SLOTS),
+    )
+    plain = generator.encode(frames, context)
+    noised = generator.encode(frames, context, noise=0.1 * torch.randn(frames.shape, generator=make_rng(0)))
+    assert torch.equal(noised.base, frames[:, 0]) and torch.equal(noised.older, plain.older)
+    assert not torch.equal(noised.maps[0], plain.maps[0])

@@ -131,13 +131,16 @@ class FlowNetwork(nn.Module):
         context: torch.Tensor,
         scroll: torch.Tensor | None = None,
         memory: torch.Tensor | None = None,
+        noise: torch.Tensor | None = None,
     ) -> FlowFeatures:
         """Of frames [B, slots, 3, H, W] in -1..1, the newest first, the context [B, n], by which move int64 [B] most of the picture
-        goes on, and memory uint8 [B, 4, H, W]: colours of the next frame and whether (over 0) they are known."""
+        goes on, and memory uint8 [B, 4, H, W]: colours of the next frame and whether (over 0) they are known. noise, of the shape
+        of the frames: added to what the U-Net sees of them, not to the frame that it changes."""
+        history = frames if noise is None else frames + noise
         embedding = self.actions(context)
         first, second, third = self._blocks("before")
         by = modulations((first, second, third), embedding)
-        fine = first.modulated(self.enter(self._padded(frames.flatten(1, 2))), by[0])
+        fine = first.modulated(self.enter(self._padded(history.flatten(1, 2))), by[0])
         middle = second.modulated(self.down[0](fine), by[1])
         coarse = third.modulated(self.down[1](middle), by[2])
         tokens = coarse.flatten(2).transpose(1, 2)

@@ -183,11 +183,11 @@ class FlowFrames:
             base, was = (carry(one, scroll, network.moves, network.over, memory) for one in (base, was))
         changes = (clean - was).abs().amax(1, keepdim=True) > CHANGED / 127.5
         level = MOST_NOISE * now.rand(batch, 1, 1, 1, 1) * (now.rand(batch, 1, 1, 1, 1) < NOISED)
-        frames = frames + level * now.randn(*frames.shape)
+        noise = level * now.randn(*frames.shape)
         with now.half():
-            seen = self._encode(frames, context, scroll, memory)
+            seen = self._encode(frames, context, scroll, memory, noise)
             draft = self._clean(seen, seen.base, torch.zeros(batch, device=now.device))
-        taught = self._taught(frames, context, scroll, memory, now)
+        taught = self._taught(frames, context, scroll, memory, noise, now)
         target = self._target(clean, taught, None, torch.zeros(batch, device=now.device), now)
         parts = {"draft": self._error(draft, target, base, changes)}
         samples = now.share >= DRAFTS
@@ -206,12 +206,12 @@ class FlowFrames:
         return Loss("generator", parts["draft"] + parts["drawn"], parts)
 
     @torch.no_grad()
-    def _taught(self, frames, context, scroll, memory, now: TrainStep) -> FlowFeatures | None:
+    def _taught(self, frames, context, scroll, memory, noise, now: TrainStep) -> FlowFeatures | None:
         """What the teacher sees; None without one."""
         if self._teacher is None:
             return None
         with now.half():
-            return self._teacher[0](frames, context, scroll, memory)
+            return self._teacher[0](frames, context, scroll, memory, noise)
 
     @torch.no_grad()
     def _target(self, clean, taught: FlowFeatures | None, noisy, t, now: TrainStep) -> torch.Tensor:
