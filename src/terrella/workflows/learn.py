@@ -218,10 +218,8 @@ class _Learning:
     def _announce(self) -> None:
         """One line about the stages to come, with their times."""
         schedule = self.schedule
-        left = {at: schedule.left_s(at) for at in _DOES if at not in schedule.facts}
-        parts = [
-            f"{_DOES[at]} {duration(seconds)}" for at, seconds in left.items() if at != DISTILLING or schedule.student
-        ]
+        stages = [at for at in _DOES if at not in schedule.facts and (at != DISTILLING or schedule.student)]
+        parts = [f"{_DOES[at]} {duration(schedule.left_s(at))}" for at in stages]
         device = describe_device(device_of(self.config.device))
         self.progress(
             f"Of {duration(schedule.seconds)} on {device} it {', '.join(parts)}; all files are in {schedule.folder}."
