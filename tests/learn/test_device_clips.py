@@ -53,6 +53,18 @@ def test_frames_before_the_clips_may_be_recalled(recording):  # noqa: F811
     torch.testing.assert_close(batch.kept_keys[some], keys_of(batch.kept[some] / 255))
 
 
+def test_frames_recorded_meanwhile_are_recalled_on_a_device_too(recording, scrolling):  # noqa: F811
+    recipe, cpu = object.__new__(FlowRecipe), torch.device("cpu")
+    network = SimpleNamespace(moves=torch.zeros(1, 2), config=SimpleNamespace(recalls=True))
+    recipe.meanwhile, recipe.over = scrolling, OVER
+    recipe.held = cast(Any, "on the device")
+    recipe.parts = cast(Any, SimpleNamespace(run=SimpleNamespace(device=cpu, report=quiet), recording=recording))
+    recipe.objective = cast(Any, SimpleNamespace(losses_per_batch=ROLLOUT, generator=network))
+    recipe.video = cast(Any, SimpleNamespace(slots=SLOTS, size=SIZE))
+    feed, rows = recipe._further_feed(4, 3)
+    assert rows == 3 * 81 and cast(Any, feed.batch(step())).kept.shape == (8, KEPT, 3, *SIZE)
+
+
 def test_the_memory_is_that_of_the_host(recording):  # noqa: F811
     stitched = stitch_episodes(recording, MOVES, OVER)
     grounds = DeviceGrounds(stitched, OVER, torch.device("cpu"))

@@ -148,13 +148,16 @@ class FlowRecipe:
             return None, f"{whole} takes more than half of {lacking}"
         try:
             grounds = None if self.stitched is None else DeviceGrounds(self.stitched, self.over, device)
-            recalls = self.objective.generator.config.recalls
-            held = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds, recalls)
+            held = self._device_clips(recording, grounds)
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
             return None, f"{whole} does not fit into {lacking}"
         return held, f"the recording on it ({size / GIB:.2g} GiB)"
+
+    def _device_clips(self, recording: Recording, grounds: DeviceGrounds | None) -> DeviceClips:
+        rollout, recalls = self.objective.losses_per_batch, self.objective.generator.config.recalls
+        return DeviceClips(recording, self.video.slots, rollout, self.parts.run.device, grounds, recalls)
 
     def feed(self, batch: int) -> Feed:
         """Clips chosen from three times as many, preferring those that change more; on a GPU from all, which lie there."""
@@ -186,8 +189,7 @@ class FlowRecipe:
         if self.held is None:
             return self._clips(recording, stitched, 2 * batch), rows
         grounds = None if stitched is None else DeviceGrounds(stitched, self.over, device)
-        clips = DeviceClips(recording, self.video.slots, self.objective.losses_per_batch, device, grounds)
-        return clips.sized(2 * batch), rows
+        return self._device_clips(recording, grounds).sized(2 * batch), rows
 
     def _first_feed(self, batch: int) -> Feed:
         if self.held is not None:
