@@ -237,6 +237,7 @@ def test_commands_that_are_printed_can_be_pasted():
         "96",
     ]
     assert changed_settings(terrella.PlanConfig(curve=False)) == {"no_curve": True}
+    assert command_line("evaluate", goal="-1,0", **{"in": "a b"}) == "evaluate --goal=-1,0 --in 'a b'", "no option"
 
 
 PACE = TrainingPace(setup_s=5.0, step_s=0.5, share=0.6)

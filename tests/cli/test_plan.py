@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from copy import copy
 from dataclasses import replace
 
@@ -130,7 +131,26 @@ def test_the_verdict_in_words_is_the_first_line(capsys, tmp_path):
     assert main([*words, "--goal", "20", "--within", "0.001", "--agent", "random", "--steps", "8"]) == 0
     first, *_, last = capsys.readouterr().out.splitlines()
     assert first == "The policy random is not seen to do better than random actions; more --episodes may tell."
-    assert last == f"next: terrella evaluate plan --in {BLIND}"
+    assert last == f"next: terrella evaluate random --in {BLIND} --goal 20 --within 0.001 --steps 8", (
+        "the same, no less"
+    )
+
+
+def test_the_printed_command_evaluates_the_same_search_towards_the_same_goal(capsys, tmp_path):
+    goal = ["--goal", "observation=20", "--within", "0.001", "--search", "tree"]
+    done = planned(capsys, BLIND, *goal, *QUICK, "--no-curve", "--out", str(tmp_path / "a"))
+    program, *words = shlex.split(done["next"])
+    assert program == "terrella"
+    assert main([*words, "--episodes", "2", "--json", "--out", str(tmp_path / "b")]) == 0
+    evaluated = json.loads(capsys.readouterr().out)
+    assert (evaluated["goal"], evaluated["within"], evaluated["steps"]) == ("observation=20", 0.001, 24)
+    assert "plan:search=tree,samples=6,iterations=2,horizon=4" in evaluated["names"].values()
+
+
+@pytest.mark.parametrize("words", [["--cost", "last"], ["--proposal", "constant:2"]])
+def test_no_command_is_printed_where_evaluate_has_no_such_search(words, capsys, tmp_path):
+    goal = ["--goal", "20", "--within", "0.001"]
+    assert "next" not in planned(capsys, BLIND, *goal, *words, *QUICK, "--no-curve", "--out", str(tmp_path))
 
 
 def test_an_agent_needs_no_reward_where_a_channel_says_what_success_is(tmp_path, monkeypatch):
@@ -200,6 +220,7 @@ def test_planning_from_python(tmp_path):
     search = terrella.SearchConfig("tree", samples=6, iterations=2, horizon=4)
     config = terrella.PlanConfig("observation=20", within=0.001, search=search, episodes=2, steps=24, out=tmp_path)
     result = terrella.plan(BLIND, config, progress=lines.append)
+    assert isinstance(result, terrella.PlanResult)
     assert result.planner["success"].value == 1 and len(result.episodes) == 2 and result.page.is_file()
     verdict, reached = result.summary().splitlines()[:2]
     assert (

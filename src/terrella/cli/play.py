@@ -41,7 +41,7 @@ def play(
         names = [world.spec.name for world in worlds]
         opened(" and ".join(names), address, {"worlds": names}, json)
         if worlds[-1].spec.card.get("kind") == "splat":
-            say(f"`terrella space view {name}` draws it in your browser, sharper, and edits it.")
+            say(f"`{command('terrella', 'space', 'view', name)}` draws it in your browser, sharper, and edits it.")
         elif name and "reward" in worlds[-1].spec.channels and not library.is_truth(name):
             after = command("terrella", "train", "policy", out=f"runs/{folder_name(name)}-policy", **{"in": name})
             say(f"After playing, train an agent in it: {after}")

@@ -7,10 +7,12 @@ from urllib.parse import urlsplit
 
 from tyro.conf import Positional, arg
 
+from ..library import is_truth
 from ..serve.guard import is_loopback
 from ..serve.qr_code import qr_text
+from ..workflows.opening import EnvironmentConfig
 from ..workflows.progress import Terminal
-from ..workflows.results import Result
+from ..workflows.results import Result, changed_settings, command
 
 # Positional arguments, by what they name.
 WorldName = Annotated[str, Positional, arg(metavar="WORLD")]
@@ -39,6 +41,14 @@ say = Terminal()  # the progress of every command
 def show(workflow: Result, json: bool, following: str = "") -> None:
     """Prints the result of a workflow on stdout, with the command that usually follows."""
     result({} if not json else workflow.to_json(), json, None if json else workflow.summary(), following)
+
+
+def playing(world: str, agent: object, environment: EnvironmentConfig) -> str:
+    """The command that plays a world with an agent; "" for a simulator with settings that `play` does not have."""
+    settings = changed_settings(environment) if is_truth(world) else {}
+    task, file = settings.pop("task", None), settings.pop("randomise", None)
+    name = f"{world}:{task}" if task else world
+    return "" if settings else command("terrella", "play", name, agent=agent, randomise=file)
 
 
 def opened(what: str, address: str, facts: Mapping[str, object], json: bool) -> None:

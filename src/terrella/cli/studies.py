@@ -1,20 +1,26 @@
 """The commands `plan`, `evaluate`, `transfer`, `bench acceleration` and `bench costs`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from ..act.planning import SearchConfig
 from ..workflows.acceleration import AccelerationConfig, measure_acceleration
 from ..workflows.costs import CostsConfig, measure_costs
 from ..workflows.evaluate import EvaluateConfig
 from ..workflows.evaluate import evaluate as run_evaluate
+from ..workflows.goals import REWARD
+from ..workflows.place_goals import is_recording
 from ..workflows.plan import plan as run_plan
+from ..workflows.plan_result import PlanResult
 from ..workflows.plan_study import PlanConfig
-from ..workflows.results import command
+from ..workflows.results import changed_settings, command
+from ..workflows.skills import SkillPlanResult
 from ..workflows.transfer import TransferConfig
 from ..workflows.transfer import transfer as run_transfer
-from .say import Json, WorldName, say, show
+from .say import Json, WorldName, playing, say, show
 
 Inside = Annotated[str, arg(name="in", help="The world to evaluate them in: a name of `terrella list`, or a path.")]
 Policies = Annotated[
@@ -38,10 +44,32 @@ def plan(world: WorldName, config: PlanConfig, json: Json = False) -> int:
         world: The world to plan in: a name of `terrella list`, the path of a checkpoint, or a simulator (gym:CartPole-v1).
     """
     outcome = run_plan(world, config, progress=say)
-    policy = "plan" if config.skills is None else str(config.skills)
-    following = command("terrella", "evaluate", policy, real=config.real, **{"in": world})
-    show(outcome, json, following)
+    show(outcome, json, _evaluating(world, config, outcome))
     return STOPPED if outcome.stopped else 0
+
+
+def _evaluating(world: str, config: PlanConfig, outcome: PlanResult | SkillPlanResult) -> str:
+    """The command that evaluates what has acted, towards the same goal; "" where `evaluate` has no such: a walk to recorded views,
+    a cost or proposals for the search, and skills with a goal in words or rollouts."""
+    policy = config.agent or "plan"
+    if isinstance(outcome, SkillPlanResult):
+        if outcome.goal is not None or config.rollouts:
+            return ""
+        policy = str(config.skills)
+    elif is_recording(config.goal) or config.proposal or config.cost != PlanConfig.cost:
+        return ""
+    elif not config.agent:
+        usual = asdict(SearchConfig().filled())
+        changed = [
+            f"{name}={outcome.settings[name]}"
+            for name in usual
+            if outcome.settings.get(name, usual[name]) != usual[name]
+        ]
+        policy += ":" * bool(changed) + ",".join(changed)
+    goal, device = (None if one == usual else one for one, usual in ((config.goal, REWARD), (config.device, "auto")))
+    aim = {"goal": goal, "within": config.within, "success": config.success}
+    options = {"in": world, "real": config.real, **aim, "steps": config.steps, "device": device}
+    return command("terrella", "evaluate", policy, **options, **changed_settings(config.environment))
 
 
 def evaluate(policies: Policies, inside: Inside, config: EvaluateConfig, json: Json = False) -> None:
@@ -50,7 +78,7 @@ def evaluate(policies: Policies, inside: Inside, config: EvaluateConfig, json: J
     A folder receives a page of plots and all figures. Stop with Ctrl-C at any time; the same command continues.
     """
     agent = next((name for name in policies if Path(name).is_dir()), None)
-    show(run_evaluate(policies, inside, config, progress=say), json, command("terrella", "play", inside, agent=agent))
+    show(run_evaluate(policies, inside, config, progress=say), json, playing(inside, agent, config.environment))
 
 
 def transfer(config: TransferConfig, json: Json = False) -> None:

@@ -23,7 +23,7 @@ from ..learn.recipes.video import TrainConfig
 from ..library import folder_of
 from ..workflows.opening import Device, load_named
 from ..workflows.progress import Report
-from ..workflows.results import command
+from ..workflows.results import command, folder_name
 from ..workflows.train import adapt as adapt_world
 from ..workflows.train import run_recipe, train_latent, train_video
 from ..worlds.folder import load_world
@@ -134,7 +134,8 @@ def latent_actions(data: RecordingName, out: str, config: LatentActionsConfig, j
         data: The recording: a folder, or an address. Its own actions, if it has any, are not used.
         out: Folder of the run: checkpoint, log, and pictures of true, inferred and random actions.
     """
-    following = command("terrella", "data", "label", out, data, out=f"{data.rstrip('/')}-labelled")
+    copy = f"{folder_name(data)}-labelled" if "://" in data else f"{data.rstrip('/')}-labelled"
+    following = command("terrella", "data", "label", out, data, out=copy)
     _shown(lambda report: train_latent_actions(data, out, config, report), json, following)
 
 
@@ -189,7 +190,9 @@ def _shown(recipe: Callable[[Report], dict], json: bool, following: str = "", **
 
 
 def _practising(out: str, data: str) -> str:
-    return command("terrella", "train", "policy", out=f"{out.rstrip('/')}-policy", **{"in": out, "from": data})
+    """The command that trains a policy in a latent world: for its reward, or without one for goals."""
+    kind = "policy" if "reward" in load_named(out, "cpu").spec.channels else "goals"
+    return command("terrella", "train", kind, out=f"{out.rstrip('/')}-{kind}", **{"in": out, "from": data})
 
 
 def _playing(out: str) -> str:

@@ -9,7 +9,7 @@ from ..workflows.inverse import InverseConfig, train_inverse
 from ..workflows.results import changed_settings, command
 from ..workflows.train_policy import TrainPolicyConfig, train_policy
 from ..workflows.verified_practice import VerifiedPracticeConfig, practise_by_rule
-from .say import Json, RecordingName, say, show
+from .say import Json, RecordingName, playing, say, show
 
 
 def policy(config: TrainPolicyConfig, world: Annotated[str | None, arg(name="in")] = None, json: Json = False) -> None:
@@ -22,7 +22,7 @@ def policy(config: TrainPolicyConfig, world: Annotated[str | None, arg(name="in"
     """
     trained = train_policy(world, config, progress=say)
     played = world or config.real
-    show(trained, json, command("terrella", "play", played, agent=trained.folder) if played else "")
+    show(trained, json, playing(played, trained.folder, config.environment) if played else "")
 
 
 def inverse(data: RecordingName, config: InverseConfig, json: Json = False) -> None:
@@ -33,10 +33,10 @@ def inverse(data: RecordingName, config: InverseConfig, json: Json = False) -> N
         data: The recording to label: a folder, or an address.
     """
     trained = train_inverse(data, config, progress=say)
-    recording, out = trained.facts.get("recording"), f"{config.out}/policy"
-    following = (
-        command("terrella", "train", "policy", method="imitation", out=out, **{"from": recording}) if recording else ""
-    )
+    recording, seen = trained.facts.get("recording"), changed_settings(config.training)
+    options = {"from": recording, "out": f"{config.out}/policy", "sees": seen.get("sees")}
+    options["picture_size"] = seen.get("picture_size")
+    following = command("terrella", "train", "policy", method="imitation", **options) if recording else ""
     show(trained, json, following)
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from ..workflows.results import command
 from .say import Json
 
 
@@ -29,7 +30,7 @@ def list_worlds(
             print(f"    {fact}: {value if isinstance(value, str) else json_text.dumps(value)}")
     for name, install in library.not_installed().items():
         print(f"not installed: {name}: {install}")
-    print(f"next: terrella play {entries[0].name}")
+    print(f"next: {command('terrella', 'play', entries[0].name)}")
 
 
 def convert_world(
@@ -44,4 +45,4 @@ def convert_world(
     from ..worlds import convert
 
     convert.convert_world(old, new)
-    print(f"{new} is ready: terrella play {new}")
+    print(f"{new} is ready: {command('terrella', 'play', new)}")

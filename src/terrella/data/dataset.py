@@ -1,6 +1,7 @@
 """Dataset: reads any LeRobotDataset v3.0, local or remote, as plain arrays."""
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -250,12 +251,13 @@ class Dataset:
         if not self.files.exists(name):
             return Readings(np.zeros(0), np.zeros((0, *sensor.shape), sensor.dtype))
         path = self.files.local(name)
+        doctor = f"`terrella data doctor {shlex.quote(str(self.root))}`"
         try:
             time_s = read_whole(path, ["time_s"])["time_s"].to_numpy().astype(np.float64)
         except (KeyError, ValueError, TypeError) as error:
-            raise DatasetError(f"{self.root / name} has no times; see `terrella data doctor {self.root}`.") from error
+            raise DatasetError(f"{self.root / name} has no times; see {doctor}.") from error
         if not np.isfinite(time_s).all() or (np.diff(time_s) < 0).any():
-            raise DatasetError(f"{self.root / name}: its times do not ascend; see `terrella data doctor {self.root}`.")
+            raise DatasetError(f"{self.root / name}: its times do not ascend; see {doctor}.")
         if sensor.kind == "image":
             film = self.files.local(stream_path(sensor.name, number, "mp4"))
             return Readings(time_s, mp4.Frames(film, 0, len(time_s), sensor.rate_hz or self.fps))

@@ -1,6 +1,7 @@
 """Reads the folder meta/ of a dataset: its facts, tasks and episodes."""
 
 import json
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from .storage.tables import read_json, read_whole
 
 def read_info(root: Path, files: LocalFiles | Files) -> dict:
     """meta/info.json; DatasetError where there is none, or it is of another version."""
-    make_one = f"record one with `terrella record world ENVIRONMENT --out {root}`"
+    make_one = f"record one with `terrella record world ENVIRONMENT --out {shlex.quote(str(root))}`"
     if not files.exists(INFO):
         if isinstance(files, LocalFiles) and not root.is_dir():
             raise DatasetError(f"there is no dataset at {root}; {make_one}.")

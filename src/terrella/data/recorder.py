@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import time
 import weakref
@@ -332,7 +333,7 @@ class Recorder:
         if not staged.fits(self.layout):
             raise DatasetError(
                 f"an interrupted episode of another layout lies in {self._staging}; "
-                f"`terrella data doctor {self.root} --repair` keeps it; deleting that folder drops it."
+                f"`terrella data doctor {shlex.quote(str(self.root))} --repair` keeps it; deleting that folder drops it."
             )
         with self._nothing_lost():
             length = staged.whole()

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -160,7 +161,8 @@ class Writer:
             except (OSError, ValueError, KeyError, TypeError, pa.ArrowException) as error:
                 first = str(error).splitlines()[0] if str(error) else type(error).__name__
                 raise DatasetError(
-                    f"{self.root} is damaged ({first}); see `terrella data doctor {self.root}`, or record to a new folder."
+                    f"{self.root} is damaged ({first}); see `terrella data doctor {shlex.quote(str(self.root))}`, or record to a "
+                    "new folder."
                 ) from error
         else:
             strangers = [entry.name for entry in self.root.iterdir() if not entry.name.startswith(".")]

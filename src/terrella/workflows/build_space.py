@@ -29,6 +29,7 @@ from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SolidBoxes, SplatConfig, SplatWorld
 from ..worlds.splat_folder import check_free, save_splat, world_of
 from .progress import Progress, silent, stage
+from .results import command
 from .splat_places import SpaceResult, page_scene, unheeded
 
 LAYOUT_FILE = "layout.json"
@@ -79,7 +80,7 @@ def fit_space(
         f"{facts['gaussians']:,} Gaussians from {facts['pictures']} pictures in {facts['seconds']:.0f} s",
         f"{facts['held_out']} held-out pictures: {ours:.1f} dB (+-{ours_by:.1f}); copying the nearest picture: "
         f"{copied:.1f} (+-{copied_by:.1f})",
-        f"walk in it: terrella play {facts['world']} (collider: {facts['collider']})",
+        f"walk in it: {command('terrella', 'play', facts['world'])} (collider: {facts['collider']})",
     ]
     if left_out := facts["left_out"]:
         more = f", and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
@@ -118,7 +119,7 @@ def import_space(file: Path, out: Path, config: ImportSpaceConfig) -> SpaceResul
     kind = world.config.collider
     facts = {"gaussians": len(scene), "world": str(out), "collider": kind, "left_out": left_out}
     chosen = f"collider: {kind}" + (" (--collider sets another)" if config.collider == "auto" else "")
-    return SpaceResult(facts, (f"{len(scene):,} Gaussians; {chosen}; terrella play {out}", *left_out))
+    return SpaceResult(facts, (f"{len(scene):,} Gaussians; {chosen}; {command('terrella', 'play', out)}", *left_out))
 
 
 def build_space(
@@ -183,7 +184,7 @@ def _built_result(place: BuiltPlace, parsed: ParsedText, out: Path) -> SpaceResu
         without = "" if find_spec("mujoco") else " (once MuJoCo is installed: pip install 'terrella[mujoco]')"
         lines.append(f"can be pushed: {', '.join(movable)}{without}")
     lines += unheeded(facts)
-    return SpaceResult(facts, (*lines, f"walk in it: terrella play {out}"))
+    return SpaceResult(facts, (*lines, f"walk in it: {command('terrella', 'play', out)}"))
 
 
 def amount(many: int, what: str) -> str:
@@ -224,7 +225,7 @@ def _of_triangles(
     shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
     text = f"{len(splats):,} Gaussians of {len(scene.corners):,} triangles, {len(scene.lights)} light(s): {shown}"
     more = [f"left out: {', '.join(scene.left_out)}"] if scene.left_out else []
-    return SpaceResult(facts, (text, *more, f"walk in it: terrella play {out}"))
+    return SpaceResult(facts, (text, *more, f"walk in it: {command('terrella', 'play', out)}"))
 
 
 def _is_size(size: tuple[int, int]) -> bool:

@@ -13,6 +13,7 @@ from ..worlds.splat import SplatWorld
 from ..worlds.splat_folder import UNDONE_FILE, checked_edits, merge_edit, merged_loader, read_edits, write_edits
 from .progress import Progress, silent
 from .put_things import put_things
+from .results import command
 from .splat_places import SpaceResult, open_splat
 
 COARSE_M = 0.3  # in wider cells doors are closed
@@ -145,8 +146,8 @@ def _result(world: str, config: EditSpaceConfig, progress: Progress) -> SpaceRes
             f"--scale makes {config.merge} smaller first."
         )
     made = f"{facts['edits']} edit(s), {len(after.gaussians):,} Gaussians"
-    more = "" if config.undo else f"; take the last one back: terrella space edit {world} --undo"
-    lines = (made + more, f"walk in it: terrella play {world}")
+    more = "" if config.undo else f"; take the last one back: {command('terrella', 'space', 'edit', world, undo=True)}"
+    lines = (made + more, f"walk in it: {command('terrella', 'play', world)}")
     return SpaceResult({**facts, "gaussians": len(after.gaussians)}, lines)
 
 

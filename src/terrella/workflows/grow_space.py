@@ -101,7 +101,7 @@ def grow_space(world: str, config: GrowSpaceConfig, *, progress: Progress = sile
         "coverage": after,
         "steps": [vars(step) for step in steps],
     }
-    return SpaceResult(facts, (*lines, f"walk in it: terrella play {folder}"))
+    return SpaceResult(facts, (*lines, f"walk in it: {command('terrella', 'play', folder)}"))
 
 
 def viewpoints(place: SplatWorld, seed: int) -> torch.Tensor:

@@ -25,6 +25,7 @@ from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SplatConfig, SplatWorld
 from ..worlds.splat_folder import check_free, save_splat
 from .progress import Progress, silent
+from .results import command, folder_name
 from .splat_places import SpaceResult
 
 MOST_ASPECT = 4.0
@@ -204,7 +205,8 @@ def _frames(picture: Path) -> list[str]:
     """A note on pictures with several frames; DatasetError for a missing or unreadable one."""
     if is_pictures(picture):
         raise DatasetError(
-            f"{picture} is a video or a folder of pictures: terrella space fit {picture} makes one place of all."
+            f"{picture} is a video or a folder of pictures, of which "
+            f"`{command('terrella', 'space', 'fit', picture, out=f'{folder_name(picture.stem)}-place')}` makes one place."
         )
     if not picture.exists():
         raise DatasetError(f"{picture} does not exist; check the path.")
@@ -252,7 +254,7 @@ def _result(
         "height_m": round(layers.height_m, 2), "near_m": round(near, 2), "far_m": round(far, 2), **layers.facts,
         "expected_error": dict(measured), "own_error": round(float(layers.error.mean()), 3), "notes": notes,
     }  # fmt: skip
-    nothing = f"beside and behind the camera is nothing: terrella space grow {out} invents it"
+    nothing = f"beside and behind the camera is nothing: `{command('terrella', 'space', 'grow', out)}` invents it"
     around = [] if "panorama" in facts else [nothing]
     lines = [
         f"{len(world.gaussians):,} Gaussians, {facts['invented']:,} of them invented: behind edges, and floor below the camera",
@@ -260,6 +262,6 @@ def _result(
         expected_error(measured),
         *notes,
         *around,
-        f"walk in it: terrella play {out}",
+        f"walk in it: {command('terrella', 'play', out)}",
     ]
     return SpaceResult(facts, tuple(lines))

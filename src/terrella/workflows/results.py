@@ -43,8 +43,10 @@ def command(*words: object, **options: object) -> str:
     given = [str(word) for word in words]
     for name, value in options.items():
         if value is not None and value is not False and value != ():
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            given += [f"--{name.replace('_', '-')}", *map(str, values)]
+            values = [str(one) for one in (value if isinstance(value, tuple) else () if value is True else (value,))]
+            flag = f"--{name.replace('_', '-')}"
+            dashed = values[:1] and values[0].startswith("-")  # no option: --goal=-1,0
+            given += [f"{flag}={values[0]}", *values[1:]] if dashed else [flag, *values]
     return shlex.join(given)
 
 

@@ -5,6 +5,7 @@ and zlib-packed uint16 millimetres (depth); nothing is ever unpickled. A folder 
 """
 
 import json
+import shlex
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
@@ -226,7 +227,9 @@ def first_line(error: Exception) -> str:
 def _foreign(path: Path, about: dict) -> str:
     kind, version = about.get("kind"), about.get("version")
     if (kind, version) == ("video", 2):
-        return f"{path} was saved by an earlier release; convert it: terrella convert-world {path} NEW."
+        return (
+            f"{path} was saved by an earlier release; convert it: terrella convert-world {shlex.quote(str(path))} NEW."
+        )
     if kind == LATENT and version == LATENT_VERSION:
         return f"{path} is a latent world, which draws nothing but for people; give a world that `train video` made."
     if kind not in (KIND, LATENT):

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -48,9 +49,8 @@ def save_splat(world: SplatWorld, path: str | Path) -> None:
         "solids": world.solids,
         "bodies": world.bodies,
     }
-    readme = (
-        f"# {world.name}\n\nA place of {len(world.gaussians):,} Gaussians: `terrella play {path.name}` walks in it.\n"
-    )
+    about_it = f"A place of {len(world.gaussians):,} Gaussians"
+    readme = f"# {world.name}\n\n{about_it}: `terrella play {shlex.quote(path.name)}` walks in it.\n"
     try:
         write_checkpoint(path, about, {"scene": tensors}, readme)
     except OSError as error:
@@ -202,7 +202,7 @@ def merged_loader(path: str | Path) -> Callable[[Edit], SplatWorld]:
         if fault:
             raise CheckpointError(
                 f"{folder}, which {path} has merged, {fault}; put it back as it was, or take the merge back "
-                f"(terrella space edit {path} --undo) and merge anew."
+                f"(terrella space edit {shlex.quote(str(path))} --undo) and merge anew."
             )
         return load_source(folder, None)
 
