@@ -12,7 +12,7 @@ from gymnasium import spaces
 
 from terrella.act.planning import SearchConfig
 from terrella.core import Spec, State, make_rng
-from terrella.core.spec import chance_error, trust_level
+from terrella.core.spec import chance_error, measured_trust, trust_level
 from terrella.learn.recipes.policy import Practice
 from terrella.measure.clips import Clip
 from terrella.measure.exam import CLIPS, Exam, ExamConfig
@@ -108,6 +108,17 @@ def test_the_scorecard_has_the_forecast_beside_the_measured_horizon(off, steps):
     assert ("not reached" in measured.note) == (steps == 30)
     ratio = [row.figure.value for row in card.find("trust", "trust horizon, measured over forecast")]
     assert ratio == ([] if steps == 30 else [steps / 20])
+
+
+def test_the_scorecard_forecasts_no_longer_than_the_world_was_measured_to_be_trusted():
+    world = Fading(0.02, card={**CARD, "trust_steps_measured": 12})
+    config = ExamConfig(horizons=(30,), control_horizons=(), long_steps=0, still_steps=0, speed_steps=0)
+    card = examine(Exam({"a": world}, {CLIPS: {"recorded": [black(32)] * 2}}, config), probes=(TRUST,))
+    (forecast,), (measured,) = (card.find("trust", f"trust horizon, {what}") for what in ("forecast", "measured"))
+    assert (forecast.figure.value, measured.figure.value) == (12, 10) and "of the world's card" in forecast.note
+    (ratio,) = card.find("trust", "trust horizon, measured over forecast")
+    assert ratio.figure.value == 10 / 12
+    assert measured_trust(replace(world.spec, card={"trust_steps_measured": "9"})) is None, "a stranger's card"
 
 
 def test_the_horizon_has_an_interval_over_clips():

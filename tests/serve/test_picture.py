@@ -213,6 +213,14 @@ def test_a_picture_dropped_on_the_page_is_stepped_into(serve_world, open_page): 
     assert page.evaluate("terrella.connected")
 
 
+def test_a_page_says_that_a_world_is_played_longer_than_it_was_measured_to_be_trusted(serve_world, open_page):  # noqa: F811
+    world = Gallery()
+    world.spec = replace(world.spec, card={"trust_steps_measured": 3})
+    page = open_page(serve_world([world]).url)
+    until(page, "document.getElementById('uncertainty').dataset.beyond === 'true'")
+    assert "was measured" in page.get_attribute("#uncertainty", "title")
+
+
 def test_a_page_of_a_world_without_doubt_has_no_bar(serve_world, open_page):  # noqa: F811
     page = open_page(serve_world([Panorama()]).url)
     assert page.evaluate("document.getElementById('uncertainty').hidden")

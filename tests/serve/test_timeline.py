@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,8 @@ from terrella.core import Spec, State, check_world, make_rng
 from terrella.core.arena import Arena
 from terrella.core.errors import DatasetError, ServeError
 from terrella.serve.actions import action_of
-from terrella.serve.history import History, Moment
-from terrella.serve.protocol import DONE, FRESH
+from terrella.serve.history import History, Image, Moment
+from terrella.serve.protocol import BEYOND, DONE, FRESH
 from terrella.serve.timeline import Timeline
 
 from .conftest import ListSink
@@ -133,7 +135,9 @@ def test_memory_is_bounded():
 def test_states_keep_to_their_budget_and_pictures_outlive_them():
     history = History(frames=10, state_bytes=4 * 800)
     for step in range(30):
-        history.push(Moment(step, (b"x",), states=(State({"z": torch.zeros(1, 100, dtype=torch.float64)}),)))
+        history.push(
+            Moment(step, (Image(0, 0, b"x"),), states=(State({"z": torch.zeros(1, 100, dtype=torch.float64)}),))
+        )
     assert len(history) == 10 and history.oldest_step == 26 and history.state_bytes == 3200
     assert history.at(0).step == 26 and history.at(99).step == 29
     history.forget_after(27)
@@ -144,7 +148,7 @@ def test_shared_memory_counts_once():
     cache = torch.zeros(1, 1000)
     history = History(frames=10, state_bytes=2**20)
     for step in range(5):
-        history.push(Moment(step, (b"x",), states=(State({"cache": cache, "n": torch.tensor([step])}),)))
+        history.push(Moment(step, (Image(0, 0, b"x"),), states=(State({"cache": cache, "n": torch.tensor([step])}),)))
     assert history.state_bytes == 4000 + 5 * 8
     history.forget_after(0)
     assert history.state_bytes == 4000 + 8
@@ -204,6 +208,22 @@ def test_a_dream_is_told_what_it_heeds():
     assert told == [{"pose", "reward"}], "and not of what the game does not show"
 
 
+def test_trust_ends_where_the_card_says_it_was_measured_until_the_dream_observes_again():
+    dream = SlowDream()
+    dream.spec = replace(dream.spec, card={"trust_steps_measured": 2})
+    both = Timeline([Panorama(), dream], 0)
+
+    def beyond(moment: Moment) -> bool:
+        return bool(moment.flags & BEYOND)
+
+    assert [beyond(both.shown), *(beyond(both.step()) for _ in range(4))] == [False, False, False, True, True]
+    assert not beyond(both.stand_at(2)) and not beyond(both.branch()), "in the past it was within"
+    assert beyond(both.step())
+    assert not beyond(both.sync()) and [beyond(both.step()) for _ in range(3)] == [False, False, True]
+    assert not beyond(both.restart(1))
+    assert not any(Timeline([Panorama()], 0).step().flags & BEYOND for _ in range(4)), "nobody measured it"
+
+
 def test_a_recording_holds_each_observation_with_what_followed():
     sink = ListSink()
     timeline = Timeline([Panorama(length=5)], seed=0, sink_factory=lambda: sink)
@@ -236,7 +256,7 @@ def test_branching_ends_the_recorded_episode():
 
 def test_play_goes_on_where_the_recording_cannot():
     class FullDisk(ListSink):
-        def add(self, *row):
+        def add(self, observation, action, reward, done):
             raise DatasetError("the disk is full; make room.")
 
     sink = FullDisk()

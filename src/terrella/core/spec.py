@@ -218,6 +218,13 @@ def chance_error(spec: Spec) -> float:
     return math.sqrt(2) if "latent" in spec.channels else math.nan
 
 
+def measured_trust(spec: Spec) -> int | None:
+    """The steps of a rollout that were measured to be within trust, from the world's card (`trust_steps_measured`): for longer it
+    is not trusted, whatever error it expects. None where the card has no such number."""
+    steps = spec.card.get("trust_steps_measured")
+    return steps if isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0 else None
+
+
 def trust_level(first: float, chance: float) -> float:
     """The error at which trust in a rollout ends: half way from `first`, that of its first step, to `chance`."""
     return first + 0.5 * max(chance - first, 0.0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from ..core.policy import Policy, Random, act
-from ..core.spec import chance_error, trust_level
+from ..core.spec import chance_error, measured_trust, trust_level
 from ..core.state import State
 from ..core.world import World, make_rng
 from .clips import Clip, evidence
@@ -77,8 +77,8 @@ def forecast_trust(
     if limit > 1 and max(expected) == min(expected):
         return None
     level = trust_level(expected[0], chance)
-    steps, most = steps_within(torch.tensor(expected), level), world.spec.card.get("trust_steps_measured")
-    if isinstance(most, int) and most < steps:
+    steps, most = steps_within(torch.tensor(expected), level), measured_trust(world.spec)
+    if most is not None and most < steps:
         return TrustForecast(most, limit, level, tuple(expected), True)
     return TrustForecast(steps, limit, level, tuple(expected))
 
@@ -113,28 +113,34 @@ def errors_of(dreamt: Results) -> torch.Tensor:
     return ((dreamt["latent"] - truth) / unit).square().mean(-1).sqrt()
 
 
-def _horizons(chance: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Of mean curves [R, T] of an error: the steps within trust [R]."""
+def _horizons(chance: float, most: float = math.inf) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Of mean curves [R, T] of an error: the steps within trust [R], `most` at most."""
 
     def steps(curves: torch.Tensor) -> torch.Tensor:
         levels = [trust_level(first, chance) for first in curves[:, 0].tolist()]
-        return _change_points(curves, torch.tensor(levels, dtype=torch.float64))
+        return _change_points(curves, torch.tensor(levels, dtype=torch.float64)).clamp(max=most)
 
     return steps
 
 
-def trust_figures(expected: torch.Tensor, error: torch.Tensor, chance: float) -> dict[str, tuple[Figure, str]]:
+def trust_figures(
+    expected: torch.Tensor, error: torch.Tensor, chance: float, most: int | None = None
+) -> dict[str, tuple[Figure, str]]:
     """Name -> (figure, note): the forecast horizon, the measured one, in steps, and, where trust ends within the rollouts, the
-    second over the first. Of rollouts [n, T]; intervals are over rollouts, the same resamples for all."""
-    steps, limit, figures = _horizons(chance), error.shape[1], {}
-    for what, curves in (("forecast", expected), ("measured", error)):
+    second over the first. Of rollouts [n, T]; intervals are over rollouts, the same resamples for all. most: of the forecast, the
+    horizon of the world's card (`measured_trust`)."""
+    limit, figures = error.shape[1], {}
+    forecast, measured = _horizons(chance, math.inf if most is None else most), _horizons(chance)
+    for what, curves, steps in (("forecast", expected, forecast), ("measured", error, measured)):
         figure = curve_interval(curves, steps, make_rng(0))
         level = trust_level(float(curves[:, 0].double().mean()), chance)
         note = f"mean error of {level:.3g}" + ("" if figure.value < limit else "; not reached in these rollouts")
+        if steps is forecast and figure.value == most:
+            note = "the measured horizon of the world's card, no longer than which it is trusted"
         figures[what] = figure, note
 
     def ratio(curves: torch.Tensor) -> torch.Tensor:
-        return steps(curves[:, limit:]) / steps(curves[:, :limit]).clamp_min(1)
+        return measured(curves[:, limit:]) / forecast(curves[:, :limit]).clamp_min(1)
 
     if max(figure.value for figure, _ in figures.values()) < limit:
         both = torch.cat([expected.double(), error.double()], 1)
@@ -151,7 +157,8 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
             if "expected" not in dreamt:
                 continue
             error = errors_of(dreamt)
-            for what, (figure, note) in trust_figures(dreamt["expected"], error, chance_error(world.spec)).items():
+            figures = trust_figures(dreamt["expected"], error, chance_error(world.spec), measured_trust(world.spec))
+            for what, (figure, note) in figures.items():
                 unit, name = "" if "over" in what else "steps", f"trust horizon, {what}"
                 report.rows.append(
                     Row("trust", "", name, unit, place, arm, PREDICTED, error.shape[1], figure, note=note)

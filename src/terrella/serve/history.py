@@ -32,6 +32,7 @@ class Moment:
     drifted: float = 0.0  # the part of it that follows from a position that has drifted; the rest is invention
     vitals: tuple[float, ...] = ()  # numbers of the first world, such as the player's health
     age: int = 0  # steps since its episode began
+    imagined: int = 0  # steps since the last world began or last observed something
 
 
 class History:

@@ -27,6 +27,7 @@ U32 = 2**32 - 1
 DONE = 1  # the episode ended with this frame
 FRESH = 2  # first frame of an episode
 REPLAY = 4  # a frame out of the history: the session stands in the past
+BEYOND = 8  # more steps were imagined since the world last observed something than it is trusted for (`measured_trust`)
 
 # version u8, flags u8, images u16, seq u32, step u32, oldest u32, newest u32, action id u32,
 # generation ms f32, episode return f32, client's time of that action f64, server's time f64, uncertainty f32,

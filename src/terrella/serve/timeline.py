@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from ..core.errors import ServeError, TerrellaError
 from ..core.policy import Policy
-from ..core.spec import Spec
+from ..core.spec import Spec, measured_trust
 from ..core.state import State
 from ..core.world import World, make_rng
 from .agent import Agents, agents_of
@@ -19,7 +19,7 @@ from .driver import Driver
 from .history import History, Image, Moment
 from .picture import MAX_DROPPED_PIXELS, picture_of, strip_of, uncertainty_levels
 from .presentation import events_of, numbers_of, outcome
-from .protocol import DONE, FRESH, Goal
+from .protocol import BEYOND, DONE, FRESH, Goal
 from .recording import SessionRecording, SinkFactory
 
 JPEG_QUALITY = 95  # with 90 plain grass of pixel art is speckled
@@ -318,6 +318,9 @@ class Timeline:
         reward = float(seen["reward"][0]) if "reward" in seen and acted else 0.0
         done = bool(seen["done"][0]) if "done" in seen and acted else False
         age = 0 if flags & FRESH else self.shown.age + 1
+        imagined = self.shown.imagined + 1 if acted else 0
+        trusted = measured_trust(self.worlds[-1].spec)
+        beyond = BEYOND * (trusted is not None and imagined > trusted)
         numbers = self._numbers(seen, acted, bool(flags & FRESH))
         ended = outcome(numbers_of(self.spec), numbers, reward, self._return, age)
         self._return += reward
@@ -327,7 +330,7 @@ class Timeline:
         moment = Moment(
             step,
             images,
-            flags | DONE * done,
+            flags | DONE * done | beyond,
             self._return,
             None if self.no_rewind else self._states,
             None if self.no_rewind else tuple(rng.get_state() for rng in self._rngs),
@@ -335,6 +338,7 @@ class Timeline:
             float(last["drifted"][0]) if "drifted" in last else 0.0,
             numbers,
             age,
+            imagined,
         )
         self.history.push(moment)
         self.shown = moment

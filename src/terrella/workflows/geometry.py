@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..core.errors import DatasetError, TerrellaError
 from ..core.numbers import check_seed
-from ..core.spec import chance_error
+from ..core.spec import chance_error, measured_trust
 from ..core.state import State
 from ..core.world import World, make_rng
 from ..data import split
@@ -163,7 +163,7 @@ def _horizons(
     by_parting = parting(step, start, dreamt.shape[1], unit, draw)
     figures = trust_figures(by_parting, error, chance)
     named = {"by geometry": figures["forecast"]}
-    own = trust_figures(expected, error, chance)
+    own = trust_figures(expected, error, chance, measured_trust(world.spec))
     return named | {"by its uncertainty": own["forecast"], "measured": own["measured"]}
 
 

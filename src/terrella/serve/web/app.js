@@ -7,7 +7,7 @@ import { Futures } from './futures.js';
 import { Goal } from './goal.js';
 import { drawKeycaps, hintsOf, keyLabel, keyMeaning, learnLayout } from './keycaps.js';
 import { KeyPanel } from './keypanel.js';
-import { DONE, FRESH, Link, REPLAY } from './link.js';
+import { BEYOND, DONE, FRESH, Link, REPLAY } from './link.js';
 import { Past, write } from './past.js';
 import { takePictures } from './picture.js';
 import { linkBack, reach } from './place/reach.js';
@@ -138,7 +138,7 @@ function paint(time) {
   if (live && !fresh && worlds[0].events.some((name) => frame.vitals[worlds[0].vitals.indexOf(name)] > now.vitals[worlds[0].vitals.indexOf(name)])) screens.strike();
   Object.assign(now, { step: frame.step, oldest: frame.oldest, newest: frame.newest, score: frame.score, flags: frame.flags, vitals: frame.vitals });
   now.actionId = Math.max(now.actionId, frame.actionId);
-  uncertainty.show(frame.uncertainty, frame.drifted, !!(frame.flags & FRESH) || !live);
+  uncertainty.show(frame.uncertainty, frame.drifted, !!(frame.flags & FRESH) || !live, !!(frame.flags & BEYOND));
   seen.painted += 1;
   keep(seen.times, time);
   keep(seen.frames, { seq: frame.seq, step: frame.step, t: at, generationMs: frame.generationMs });

@@ -1,7 +1,7 @@
 // The connection: one WebSocket, frames decoded off the main thread, acknowledged, and reconnection.
 
 const VERSION = 4, HEADER = 56;
-export const DONE = 1, FRESH = 2, REPLAY = 4;
+export const DONE = 1, FRESH = 2, REPLAY = 4, BEYOND = 8;
 
 /** A frame message (see serve/protocol.py) as its numbers and its JPEG bytes. */
 export function readFrame(buffer) {

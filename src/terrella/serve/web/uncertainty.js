@@ -18,8 +18,8 @@ export class Uncertainty {
   }
 
   /** The error to expect of the frame just painted (mean, of intensities 0 to 1), and the part of it by a position that has drifted;
-   *  the rest is invention. `now`: without easing. */
-  show(error, drifted, now) {
+   *  the rest is invention. `now`: without easing. `late`: it has imagined longer than it was measured to be trusted. */
+  show(error, drifted, now, late) {
     if (!this.limits || error < 0) return;
     const [usual, high, lost, trusted] = this.limits, first = now || this.value < 0, ease = (from, to) => first ? to : from + 0.15 * (to - from);
     this.value = ease(this.value, error - drifted);
@@ -27,10 +27,11 @@ export class Uncertainty {
     const bound = this.level === 'high' ? 0.85 : 1;  // a level is left later than it is entered: no flicker
     this.level = this.value >= bound * high ? 'high' : this.value >= usual + bound * 0.4 * (high - usual) ? 'medium' : 'low';
     const away = this.drifted >= lost * (this.root.dataset.drifted === 'true' ? 0.85 : 1);
-    const beyond = this.value + this.drifted >= trusted * (this.root.dataset.beyond === 'true' ? 0.9 : 1);
+    const far = this.value + this.drifted >= trusted * (this.root.dataset.beyond === 'true' ? 0.9 : 1), beyond = far || late;
     const share = Math.min(1, this.value / (1.6 * high)).toFixed(3), percent = (part) => `${(100 * part).toFixed(1)}%`;
-    if (`${share} ${percent(this.drifted)}` === this.shown) return;
-    this.shown = `${share} ${percent(this.drifted)}`;
+    const shown = `${share} ${percent(this.drifted)} ${beyond} ${far}`;
+    if (shown === this.shown) return;
+    this.shown = shown;
     this.fill.style.transform = `scaleX(${share})`;
     this.root.dataset.level = this.level;
     this.root.dataset.drifted = away;
@@ -39,6 +40,7 @@ export class Uncertainty {
     this.root.ariaValueNow = this.value;
     this.root.title = `${WORDS[this.level]}. ${this.measure}: ${percent(this.value)} by invention, `
       + `${percent(this.drifted)} by a position that has drifted. `
-      + (beyond ? 'Beyond trust: nearer to a random one than to the truth' : 'Within trust');
+      + (far ? 'Beyond trust: nearer to a random one than to the truth'
+        : late ? 'Beyond trust: it was measured to be nearer to a random one than to the truth after fewer steps' : 'Within trust');
   }
 }
