@@ -417,6 +417,11 @@ def test_the_steps_that_there_will_be_are_said_once_as_soon_as_the_pace_is_known
     monkeypatch.setattr(module.Trainer, "_waits", False)  # as on a GPU
     trainer_in(tmp_path / "d", 10**9, Compiling(), hours=60 / 3600).train(paced=said.append)
     assert said == [15, 12, 12, 10], "the first step alone is compiled"
+    pictures = iter([10.0] + [0.0] * 99)
+    trainer_in(tmp_path / "e", 10**9, Compiling(), strip_every_s=5.0, hours=90 / 3600).train(
+        lambda: passes(next(pictures)), said.append
+    )
+    assert said[4:] == [15], "and the first picture alone is slow: 24 s, 10 s, then 4 s a step"
 
 
 def test_a_stage_takes_at_most_its_share(tmp_path):

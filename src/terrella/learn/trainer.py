@@ -218,8 +218,12 @@ class Trainer:
                 looked = now
             if draw is not None and now - drawn > run.strip_every_s:
                 draw()
+                if not self._waits and drawn == began:
+                    timed = None  # nor does the first picture say how long the others take
                 drawn = time.monotonic()
-            if paced is not None and (drawn > began or now - began > PACE_S) and self.steps_done > timed[1]:
+            if paced is None or timed is None or self.steps_done <= timed[1]:
+                continue
+            if now - timed[0] > PACE_S or (self._waits and drawn > began):
                 per_s = (self.steps_done - timed[1]) / (time.monotonic() - timed[0])
                 left_s = self.limit_s - before - (timed[0] - began)
                 paced(min(self.batches * self.strides, timed[1] + int(left_s * per_s)))

@@ -162,7 +162,7 @@ def floor_plan(walls: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
     start, end = walls[real].double().split(2, -1)
     long = (end - start).norm(dim=1) > 0.02
     if not long.any():
-        return torch.zeros(0, 4)
+        return walls.new_zeros(0, 4)
     start, end, origin = start[long], end[long], origin[long]
     weight = (end - start).norm(dim=1) / ((start + end) / 2 - origin).norm(dim=1).clamp_min(0.5) ** 2
     for _ in range(2):

@@ -70,7 +70,7 @@ def drift_frames(
 
     def note(conditioning: Conditioning, clean: torch.Tensor, gone: torch.Tensor) -> None:
         answer = network(input_maps(conditioning, clean), situation_of(placed(gone), conditioning))
-        seen.append(network.calibrated(answer.mean((1, 2))))
+        seen.append(network.calibrated(answer.mean((1, 2))).cpu())
 
     dreamer = world.replaced(uncertainty=UncertaintyProbe(note))
     rng, parts, half = np.random.default_rng([seed, 14]), [], LOOKS // 2
@@ -87,7 +87,8 @@ def drift_frames(
         drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
         if step in looks:
             error = (drawn - recording.rgb(rows).float()).abs().mean((1, 2, 3)) / 255
-            parts.append(DriftFrames(state["gone"], seen[-1], error, torch.full_like(state["gone"][:, 0], step)))
+            gone = state["gone"].cpu()
+            parts.append(DriftFrames(gone, seen[-1], error, torch.full_like(gone[:, 0], step)))
         seen.clear()
         if time.monotonic() - began > limit_s:
             break

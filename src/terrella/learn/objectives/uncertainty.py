@@ -96,7 +96,7 @@ def learn_uncertainty(
         raise DatasetError(
             f"no {max(SHOWN) + MIN_HORIZON} rows in a row can be predicted to learn uncertainty from; record longer episodes."
         )
-    seen = _kept(run, world, recording, DreamSettings(frames, horizon, seed=run.seed))
+    seen = _kept(run, world.to(run.device), recording, DreamSettings(frames, horizon, seed=run.seed))
     apart = seen.episode % _APART == 0
     learned, others = seen.at(~apart), seen.at(apart)
     uncertainty = fit_uncertainty(run, learned, _steps(frames))
@@ -122,7 +122,8 @@ def calibrate_drift(run: Run, world: LearnedWorld, recording: Recording, frames:
     network.invents.clamp_(max=0.6 * float(network.ceiling))
     network.sure.clamp_(max=0.5 * float(network.invents))
     limit_s = DRIFTING * run.budget.most_s("uncertainty")
-    fit_drift(network, drift_frames(world, recording, horizon, seed=run.seed, limit_s=limit_s))
+    dreamer = world.to(run.device)
+    fit_drift(network, drift_frames(dreamer, recording, horizon, seed=run.seed, limit_s=limit_s))
     return {"ceiling": float(network.ceiling), "drift_steps": horizon}
 
 

@@ -186,7 +186,9 @@ def _trained(pair: Paired, run: Run, trainer: Trainer, student: Student, about: 
         card = {"uncertainty": None, **about(step)}
         world = pair.world.replaced(generator=learned, steps=student.flow_steps, uncertainty=None, card=card)
         save_world(world, run.out / "world")
-        draw_strip((pair.world, world), pair.recording, run.out / f"strip-{step:06d}.png")
+        draw_strip(
+            [one.to(run.device) for one in (pair.world, world)], pair.recording, run.out / f"strip-{step:06d}.png"
+        )
 
     trainer.train(draw)
     draw()

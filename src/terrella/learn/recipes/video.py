@@ -171,7 +171,8 @@ class _Training:
             return took_s
         budget, frames, usual_s = self.run.budget, self.config.uncertainty_frames, 0.0
         if frames:
-            usual_s = 1.2 * uncertainty_seconds(self.recipe.world(trainer), self.parts.recording, frames)
+            world = self.recipe.world(trainer).to(self.run.device)
+            usual_s = 1.2 * uncertainty_seconds(world, self.parts.recording, frames)
         share = min(1.0, budget.most_s("uncertainty") / max(usual_s, 1e-6))
         trainer.facts["share"] = share
         return max(1e-6, took_s + budget.left_s - share * usual_s)
@@ -204,7 +205,7 @@ class _Training:
         world = self.recipe.world(self.trainer)
         worlds = (world, world.without_memory()) if self.parts.video.geometry else (world,)
         strip = self.run.out / f"strip-{self.trainer.steps_done:06d}.png"
-        draw_strip(worlds, self.parts.recording, strip)
+        draw_strip([one.to(self.run.device) for one in worlds], self.parts.recording, strip)
         with replacing(self.run.out / "newest.png") as staged:
             shutil.copyfile(strip, staged)
         save_world(world, self.run.out / "world")
