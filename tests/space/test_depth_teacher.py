@@ -102,3 +102,12 @@ def test_the_command_says_by_which_network_depth_is(tmp_path, capsys):
     file = network(tmp_path / "net.onnx")
     given = ["space", "lift", str(tmp_path / "a.png"), "--out", str(tmp_path / "w"), "--longest", "64", "--depth", file]
     assert main(given) == 0 and "depth by" in capsys.readouterr().out
+
+
+def test_a_folder_is_taken_if_it_holds_one_network(tmp_path):
+    rgb = ramp()[1].rgb
+    with pytest.raises(TerrellaError, match="is a folder; give one .onnx file .none in it"):
+        inverse_depth(rgb, str(tmp_path))
+    (tmp_path / "onnx").mkdir()
+    one = network(tmp_path / "onnx" / "model.onnx")
+    assert torch.equal(inverse_depth(rgb, str(tmp_path)), inverse_depth(rgb, one))

@@ -309,10 +309,15 @@ def test_what_cannot_be_lifted_is_refused_in_one_sentence_and_nothing_is_written
     picture_file(tmp_path / "many" / "a.png")
     (tmp_path / "empty").mkdir()
     long = picture_file(tmp_path / "long.png", (1280, 64))
+    cut_short, clear = picture_file(tmp_path / "cut.jpg"), tmp_path / "clear.png"
+    cut_short.write_bytes(cut_short.read_bytes()[:-200])
+    Image.new("RGBA", (64, 64)).save(clear)
     for path, words in (
         (tmp_path / "text.png", "cannot be read"),
         (tmp_path / "none.png", "does not exist; check the path"),
-        (long, "4 to 1"),
+        (long, "20 times as wide as it is high"),
+        (cut_short, "incomplete: the file ends"),
+        (clear, "transparent throughout"),
         (tmp_path / "many", "terrella space fit"),
         (tmp_path / "empty", "a folder without pictures"),
     ):
@@ -338,3 +343,25 @@ def test_a_page_of_text_and_a_fisheye_are_named():
     row, column = torch.meshgrid(torch.arange(48) - 24, torch.arange(64) - 32, indexing="ij")
     circle = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0)) * (row**2 + column**2 < 24**2)
     assert "fisheye" in doubts(replace(layers, rgb=circle))[0]
+
+
+def test_nothing_stands_where_a_picture_is_transparent(tmp_path, capsys):
+    rgb = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    alpha = np.full((64, 64), 255, np.uint8)
+    alpha[:, :16] = 0
+    exif = Image.Exif()
+    exif[274] = 6  # the transparent left comes to lie above
+    Image.fromarray(np.dstack([rgb, alpha])).save(tmp_path / "cut.png", exif=exif)
+    facts = lifted(tmp_path / "cut.png", tmp_path, capsys)[1]
+    assert facts["seen"] == 48 * 64 and "25% of the picture is transparent: nothing stands there." in facts["notes"]
+    world = open_splat(str(tmp_path / "place"))
+    depth = world.render(world.start(1, terrella.make_rng(0)), ("depth",))["depth"][0]
+    high = depth.shape[0]
+    assert float((depth[: high // 5] > 0).float().mean()) < 0.05 < 0.9 < float((depth[high // 2 :] > 0).float().mean())
+
+
+def test_dark_pictures_and_views_from_above_are_named():
+    layers = replace(a_box_before_a_wall(), error=torch.full((48, 64), 0.1))
+    assert "5% of white" in doubts(replace(layers, rgb=layers.rgb / layers.rgb.max() * 0.05))[0]
+    assert "50 degrees down" in doubts(replace(layers, pitch=math.radians(-50)))[0]
+    assert doubts(replace(layers, pitch=math.radians(-30))) == []

@@ -129,7 +129,7 @@ def test_panoramas_go_in_and_come_out(tmp_path, capsys):
     "size, options, words",
     [
         ((300, 200), ["--panorama"], "300 x 200 pixels"),
-        ((1280, 64), ["--panorama"], "twice as wide as high"),
+        ((900, 300), ["--panorama"], "twice as wide as high"),
         ((128, 64), ["--panorama"], "256 wide"),
         ((512, 256), ["--panorama", "--fov", "90"], "leave one out"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +13,17 @@ from PIL import Image
 from terrella import load
 from terrella.cli import main
 from terrella.core.errors import DatasetError
+from terrella.learn.recipes.splat_views import SplatFit
 from terrella.space.camera import FAR_M, rotation
 from terrella.space.fitting import PosedViews
 from terrella.space.pictures import is_pictures, posed_pictures
 from terrella.space.pictures.colmap import read_colmap
-from terrella.space.pictures.posed import to_views
+from terrella.space.pictures.posed import shown_name, to_views
 from terrella.space.pictures.reading import blurred, read_picture, sharpness
 from terrella.space.pictures.transforms import read_transforms
 from terrella.space.raster import rasterise
 from terrella.space.stereo import with_depth
+from terrella.workflows import build_space
 from terrella.worlds.splat import SplatWorld
 
 from .test_fitting import room, views
@@ -348,8 +351,8 @@ def wrong_poses(folder, doc):
         (unknown_model, "ORTHOPHOTO"),
         (all_lost, "none of its 20 pictures is there, such as 000.png"),
         (some_lost, "7 posed pictures (left out: 003.png (absent), 004.png (absent)"),
-        (no_picture, "003.png cannot be read as a picture"),
-        (cut, "003.png cannot be read as a picture"),
+        (no_picture, "003.png is incomplete"),
+        (cut, "003.png is incomplete"),
         (tiny, "003.png is 5 x 5 pixels"),
         (other_shape, "003.png is 90 x 40"),
         (few, "there are 5 posed pictures"),
@@ -390,7 +393,33 @@ def test_plain_pictures_without_overlap(tmp_path, capsys):
         Image.fromarray(noise).resize((96, 72), Image.Resampling.BICUBIC).save(tmp_path / "set" / f"{k}.png")
     assert main(["space", "fit", str(tmp_path / "set"), "--out", str(tmp_path / "run")]) == 2
     assert "overlap too little" in capsys.readouterr().err
-    assert not (tmp_path / "run" / "world").exists()
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_set_of_pictures_is_refused_before_anything_is_written(tmp_path, capsys):
+    (tmp_path / "dark").mkdir()
+    for k in range(9):
+        Image.new("RGB", (96, 72)).save(tmp_path / "dark" / f"{k}.png")
+    Image.new("RGB", (96, 72)).save(tmp_path / "one.png")
+    for name, why in (
+        ("dark", "0 sharp pictures (9 of 9 are of one colour)"),
+        ("one.png", "is one file; of a single picture `terrella space lift`"),
+        ("none", "does not exist; check the path"),
+    ):
+        assert main(["space", "fit", str(tmp_path / name), "--out", str(tmp_path / "run")]) == 2
+        assert why in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+def test_copies_are_named_as_their_sources():
+    assert [shown_name(Path(name)) for name in ("a.JPG.png", "a.png", "00005.png")] == ["a.JPG", "a.png", "00005.png"]
+
+
+def test_a_poor_fit_is_called_poor(monkeypatch):
+    facts = {"gaussians": 9, "pictures": 9, "seconds": 1, "held_out": 3, "world": "w", "collider": "open", "left_out": []}
+    for ours, copied, poor in ((14.7, 13.6, True), (24, 23, True), (24, 15, False)):
+        both = {"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]}
+        monkeypatch.setattr(build_space, "fit_splat", lambda *_: facts | both)
+        assert any("poor" in line for line in build_space.fit_space("a", "b", SplatFit()).lines) == poor
 
 
 def test_a_recording_with_a_picture_beside_its_data_is_no_folder_of_pictures(tmp_path):

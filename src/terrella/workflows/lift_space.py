@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from ..space.lifting.network import Lifter, load_lifter
 from ..space.lifting.panorama import PanoramaLayers, panorama_gaussians, panorama_layers, wraps
 from ..space.occupancy import Walker
 from ..space.pictures import is_pictures
-from ..space.pictures.reading import read_picture
+from ..space.pictures.reading import opaque_part, read_picture
 from ..space.raster import join
 from ..worlds.additions import INVENTED, OBSERVED
 from ..worlds.splat import SplatConfig, SplatWorld
@@ -32,6 +32,7 @@ MOST_ASPECT = 4.0
 NARROWEST = 256  # pixels of the width of a panorama
 UNSURE, FLAT, PLAIN = 0.27, 1.35, 0.02  # expected error of depth; farthest over nearest; contrast of the picture
 ONE_COLOUR, RIM = 0.6, 0.95  # share of pixels of one colour; of the dark ones outside the circle that a fisheye fills
+DARK, STEEP = 0.3, -0.65  # share of white; pitch in radians, lower than of most pictures that the network learned from
 EYE_M = (0.3, 2.2)  # heights of eyes that walk
 AXES = "x forward, y left, z up; metres; floor at 0"
 
@@ -87,12 +88,15 @@ def lift_space(picture: Path, out: Path, config: LiftSpaceConfig, *, progress: P
         )
     rgb = read_picture(picture, longest=config.longest)
     height, width = rgb.shape[:2]
-    if max(height, width) > MOST_ASPECT * min(height, width):
-        raise DatasetError(f"{picture} is {width} x {height} pixels after scaling; crop it to at most 4 to 1.")
     focal = None
     if config.fov is not None:
         focal = 0.5 * width / math.tan(math.radians(config.fov) / 2) / max(height, width)
     layers = layers_of(rgb, lifter, focal, config.eye)
+    if (opaque := opaque_part(picture, (height, width))) is not None and not opaque.all():
+        if not opaque.any():
+            raise DatasetError(f"{picture} is transparent throughout; save it without its alpha channel.")
+        layers = replace(layers, opaque=torch.from_numpy(opaque))
+        notes.append(f"{1 - opaque.mean():.0%} of the picture is transparent: nothing stands there.")
     if config.depth is not None:
         progress("running the depth network")
         layers, agreement = with_teacher(layers, config.depth)
@@ -120,9 +124,13 @@ def _lift_panorama(
             f"{picture} is {width} x {height} pixels after scaling; a panorama is equirectangular, twice as wide as high, "
             f"and {NARROWEST} wide or more. Leave --panorama out for a picture of one direction."
         )
+    if not wraps(rgb):
+        notes.append("its left and right edges do not meet, as those of all directions do: expect a seam behind you.")
     even = np.asarray(Image.fromarray(rgb).resize((width // 4 * 4, width // 4 * 2), Image.Resampling.BOX))
     layers = panorama_layers(even, lifter, config.eye)
-    world = panorama_place(layers, picture.stem, {"panorama": picture.name}, config.collider)
+    notes += (doubtful := [*_doubts_of_colours(layers.rgb.flatten(1)), *_doubts_of_error(layers.error)])
+    card = {"panorama": picture.name} | ({"doubts": doubtful} if doubtful else {})
+    world = panorama_place(layers, picture.stem, card, config.collider)
     save_splat(world, out)
     seen = _Seen(layers.distance, layers.error, layers.height_m, {"panorama": True}, "all directions, ")
     return _result(seen, world, out, lifter.measured, notes)
@@ -162,35 +170,47 @@ def _walker(height_m: float) -> Walker:
 
 def doubts(layers: PictureLayers) -> list[str]:
     """Why the place may be poor, by what was measured."""
-    error, reach = float(layers.error.mean()), layers.depth.flatten()[::7].quantile(torch.tensor([0.05, 0.95]))
-    ratio, contrast = float(reach[1] / reach[0]), float(layers.rgb.std(dim=(1, 2)).max())
-    notes = []
-    if contrast < PLAIN:
+    shown = torch.ones_like(layers.depth, dtype=torch.bool) if layers.opaque is None else layers.opaque
+    near, far = layers.depth[shown][::7].quantile(torch.tensor([0.05, 0.95])).tolist()
+    notes = _doubts_of_colours(layers.rgb[:, shown])
+    if not notes and far / near < FLAT:
         notes.append(
-            f"the picture is plain (contrast {contrast:.3f}; below {PLAIN} nothing shows depth): the place is a guess."
-        )
-    elif ratio < FLAT:
-        notes.append(
-            f"the picture shows little depth (its far parts are {ratio:.2f} times as far as its near ones): a wall, a logo or text?"
-        )
-    elif (share := _share_of_one_colour(layers.rgb)) > ONE_COLOUR:
-        notes.append(
-            f"{100 * share:.0f}% of the picture is one colour, as of text, a logo or a cut-out figure: nothing shows its depth."
+            f"the picture shows little depth (its far parts are {far / near:.2f} times as far as its near ones): a wall, a logo or text?"
         )
     if _is_round(layers.rgb):
         notes.append("the picture is round, as a fisheye's: straight lines come out bent; rectify it before.")
-    if error > UNSURE:
+    if layers.pitch < STEEP:
         notes.append(
-            f"the network is unsure of the depth (it estimates an error of {100 * error:.0f}%; for pictures like those "
-            f"it learned from, below {100 * UNSURE:.0f}%): the place may be wrong."
+            f"it is taken for a view from above (the camera looks {-math.degrees(layers.pitch):.0f} degrees down), as of a table: "
+            "a portrait, a logo or a close-up comes out tilted."
         )
-    return notes
+    return [*notes, *_doubts_of_error(layers.error)]
 
 
-def _share_of_one_colour(rgb: torch.Tensor) -> float:
-    """The share of pixels of a picture [3, H, W] in 0..1 that have its commonest colour, in steps of 1/64."""
-    steps = (63 * rgb).round().long().flatten(1)
-    return float(((steps[0] * 64 + steps[1]) * 64 + steps[2]).bincount().max() / steps.shape[1])
+def _doubts_of_colours(colours: torch.Tensor) -> list[str]:
+    """What colours [3, N] in 0..1 say against a picture: it is plain, or dark, or mostly of one colour."""
+    contrast, bright = float(colours.std(dim=1).max()), float(colours.max())
+    if bright < DARK and contrast > 0:
+        return [f"the picture is dark (its brightest pixel has {bright:.0%} of white): brighten it and lift it again."]
+    if contrast < PLAIN:
+        return [f"the picture is plain (contrast {contrast:.3f}; below {PLAIN} nothing shows depth): the place is a guess."]
+    steps = (63 * colours).round().long()
+    share = float(((steps[0] * 64 + steps[1]) * 64 + steps[2]).bincount().max() / steps.shape[1])
+    if share > ONE_COLOUR:
+        return [
+            f"{share:.0%} of the picture is one colour, as of text, a logo or a cut-out figure: nothing shows its depth."
+        ]
+    return []
+
+
+def _doubts_of_error(expected: torch.Tensor) -> list[str]:
+    """What the network's own estimate of its error, as a share of depth, says against a picture."""
+    if (error := float(expected.mean())) <= UNSURE:
+        return []
+    return [
+        f"the network is unsure of the depth (it estimates an error of {error:.0%}; for pictures like those "
+        f"it learned from, below {UNSURE:.0%}): the place may be wrong."
+    ]
 
 
 def _is_round(rgb: torch.Tensor) -> bool:
@@ -202,23 +222,26 @@ def _is_round(rgb: torch.Tensor) -> bool:
 
 
 def _frames(picture: Path) -> list[str]:
-    """A note on pictures with several frames; DatasetError for a missing or unreadable one."""
+    """A note on pictures with several frames; DatasetError for a missing, unreadable or very long one."""
     if is_pictures(picture):
         raise DatasetError(
             f"{picture} is a video or a folder of pictures, of which "
             f"`{command('terrella', 'space', 'fit', picture, out=f'{folder_name(picture.stem)}-place')}` makes one place."
         )
     if not picture.exists():
-        raise DatasetError(f"{picture} does not exist; check the path.")
+        raise DatasetError(f"{picture} does not exist; check the path (of words, `terrella space build` makes a place).")
     if picture.is_dir():
         raise DatasetError(f"{picture} is a folder without pictures; give a picture, or a folder of them to space fit.")
     try:
         with Image.open(picture) as opened:
-            many = getattr(opened, "n_frames", 1)
+            many, (width, height) = getattr(opened, "n_frames", 1), opened.size
     except Image.DecompressionBombError:
         return []  # read_picture names the limit
     except (OSError, ValueError) as fault:
         raise DatasetError(f"{picture} cannot be read as a picture; save it as JPEG or PNG.") from fault
+    if (aspect := max(height, width) / min(height, width)) > MOST_ASPECT:
+        way = "wide as it is high" if width > height else "high as it is wide"
+        raise DatasetError(f"{picture} is {aspect:.0f} times as {way}; crop it to at most {MOST_ASPECT:.0f} times.")
     return [f"the first of its {many} frames is used."] if many > 1 else []
 
 

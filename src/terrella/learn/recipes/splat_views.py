@@ -61,6 +61,13 @@ def read_views(data: str | Path, out: Path, config: SplatFit) -> tuple[PosedView
         views, dull = to_views(shots, config.longest)
         points, left_out = shots.points * config.scale, sorted({*unplaced, *dull})
     else:
+        if "://" not in str(data) and not path.is_dir():
+            problem = (
+                "is one file; of a single picture `terrella space lift` makes a place, and videos end in .mp4, .mov or .webm"
+                if path.exists()
+                else "does not exist; check the path"
+            )
+            raise DatasetError(f"{data} {problem}.")
         if path.is_dir() and not (path / INFO).exists():
             raise DatasetError(
                 f"{data} is no recording (it has no {INFO}) and no folder of pictures: those lie in it themselves, or a "

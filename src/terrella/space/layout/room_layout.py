@@ -123,7 +123,7 @@ def read_layout(source: str | Path | Mapping[str, Any]) -> RoomLayout:
         try:
             content = json.loads(Path(source).read_text())
         except OSError as error:
-            raise ContractError(f"{source} cannot be read ({error.strerror}); give a layout.json.") from error
+            raise ContractError(f"{source} cannot be read ({error.strerror}); give words, or a layout.json.") from error
         except ValueError as error:
             raise ContractError(f"{source} is no JSON ({error}); docs/space.md shows a layout.") from error
     if not isinstance(content, Mapping):

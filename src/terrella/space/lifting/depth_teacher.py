@@ -82,6 +82,12 @@ def _session(source: str) -> Any:
     import onnxruntime
 
     file = _downloaded(source) if source in HUB else Path(source)
+    if file.is_dir():
+        inside = sorted(file.rglob("*.onnx"))
+        if len(inside) != 1:
+            names = ", ".join(str(one.relative_to(file)) for one in inside[:5]) or "none"
+            raise TerrellaError(f"--depth {source} is a folder; give one .onnx file ({names} in it).")
+        file = inside[0]
     if not file.is_file():
         raise TerrellaError(f"--depth {source}: there is no such file; give an .onnx file, or one of {', '.join(HUB)}.")
     try:

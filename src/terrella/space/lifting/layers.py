@@ -45,6 +45,7 @@ class PictureLayers:
     pitch: float
     roll: float
     height_m: float
+    opaque: torch.Tensor | None = None  # bool [H, W]: the pixels that become Gaussians; None: all
 
     @property
     def camera(self) -> Intrinsics:
@@ -216,10 +217,11 @@ def _points(depth: torch.Tensor, layers: PictureLayers) -> torch.Tensor:
 def to_gaussians(layers: PictureLayers, two: bool = True) -> tuple[Gaussians, torch.Tensor]:
     """The Gaussians of a picture, and which were seen: bool [N]. Of the hidden layer (if `two`) only what shows once the camera
     moves. Each covers its pixel, tilted as the surface is."""
-    first = _of_pixels(layers.depth, layers.rgb, torch.ones_like(layers.depth, dtype=torch.bool), layers)
+    shown = torch.ones_like(layers.depth, dtype=torch.bool) if layers.opaque is None else layers.opaque
+    first = _of_pixels(layers.depth, layers.rgb, shown, layers)
     if not two:
         return first, torch.ones(len(first), dtype=torch.bool)
-    more = _of_pixels(layers.behind, layers.behind_rgb, layers.hides > HIDES, layers)
+    more = _of_pixels(layers.behind, layers.behind_rgb, (layers.hides > HIDES) & shown[::2, ::2], layers)
     return join([first, more]), torch.arange(len(first) + len(more)) < len(first)
 
 

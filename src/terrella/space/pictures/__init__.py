@@ -8,8 +8,8 @@ from PIL import Image
 
 from ...core.errors import DatasetError
 from . import colmap, transforms
-from .posed import FEWEST, Shots
-from .reading import ENDINGS, VIDEOS, blurred, read_picture, sharpness, video_pictures
+from .posed import FEWEST, Shots, shown_name
+from .reading import ENDINGS, VIDEOS, blurred, is_plain, read_picture, sharpness, video_pictures
 
 LONGEST = 1600  # pixels of pictures whose poses are looked for
 
@@ -35,13 +35,25 @@ def posed_pictures(path: Path, work: Path, frames: int) -> tuple[Shots, list[str
         shots, out = colmap.read_colmap(path), []
     else:
         if colmap.model_of(work) is None:
-            sizes = _stage(path, work, frames)
-            colmap.place_pictures(work, film=path.is_file(), alike=sizes == 1)
+            _place(path, work, frames)
         shots = colmap.read_colmap(work)
         names = {file.name for file in shots.files}
-        out = sorted(file.name for file in _pictures(work / "images") if file.name not in names)
+        out = sorted(shown_name(file) for file in _pictures(work / "images") if file.name not in names)
     rows = np.linspace(0, len(shots.files) - 1, min(frames, len(shots.files))).round().astype(int)
     return shots.at(rows.tolist()), [*out, *shots.left_out]
+
+
+def _place(path: Path, work: Path, frames: int) -> None:
+    """Computes the poses of a folder of pictures or of a video in `work`; leaves nothing behind where that fails."""
+    fresh = not work.parent.exists()
+    try:
+        sizes = _stage(path, work, frames)
+        colmap.place_pictures(work, film=path.is_file(), alike=sizes == 1)
+    except BaseException:
+        shutil.rmtree(work, ignore_errors=True)
+        if fresh and work.parent.exists():
+            work.parent.rmdir()
+        raise
 
 
 def _stage(path: Path, work: Path, frames: int) -> int:
@@ -52,10 +64,13 @@ def _stage(path: Path, work: Path, frames: int) -> int:
         files = _pictures(path)
         files = [files[k] for k in np.linspace(0, len(files) - 1, min(frames, len(files))).round().astype(int)]
         named = {file.name: read_picture(file, longest=LONGEST) for file in files}
-    bad = blurred([sharpness(one) for one in named.values()])
-    kept = {name: one for (name, one), out in zip(named.items(), bad) if not out}
+    shown = {name: one for name, one in named.items() if not is_plain(one)}
+    bad = blurred([sharpness(one) for one in shown.values()])
+    kept = {name: one for (name, one), out in zip(shown.items(), bad) if not out}
     if len(kept) < FEWEST:
-        raise DatasetError(f"{path} has {len(kept)} sharp pictures, and a fit needs {FEWEST} or more; take more.")
+        blank = f" ({len(named) - len(shown)} of {len(named)} are of one colour)" if len(shown) < len(named) else ""
+        count = f"{len(kept)} sharp picture{'s' * (len(kept) != 1)}"
+        raise DatasetError(f"{path} has {count}{blank}, and a fit needs {FEWEST} or more; take more.")
     shutil.rmtree(work, ignore_errors=True)
     (work / "images").mkdir(parents=True)
     for name, one in kept.items():

@@ -23,7 +23,7 @@ def _pycolmap() -> Any:
         raise DatasetError(
             "COLMAP's models and plain pictures need pycolmap: pip install 'terrella[colmap]'."
         ) from error
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value  # failures are raised
     return pycolmap
 
 

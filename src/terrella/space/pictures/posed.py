@@ -14,7 +14,7 @@ from ...core.errors import DatasetError
 from ..camera import FAR_M, rotation
 from ..fitting import PosedViews
 from ..raster.move import multiply_quaternions, quaternion_of
-from .reading import blurred, read_picture, sharpness
+from .reading import ENDINGS, blurred, read_picture, sharpness
 
 FEWEST = 8  # pictures of a fit
 MIDDLE_M = 3.0  # how far away the middle point lies where nothing says how long a unit is
@@ -66,6 +66,11 @@ class Shots:
 def absent(name: str) -> str:
     """The name of a listed file that is absent, for people."""
     return f"{name} (absent)"
+
+
+def shown_name(file: Path) -> str:
+    """The name of a picture for people: of a copy, such as a.jpg.png, that of its source."""
+    return file.stem if Path(file.stem).suffix.lower() in ENDINGS else file.name
 
 
 def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
@@ -122,7 +127,7 @@ def to_views(shots: Shots, longest: int) -> tuple[PosedViews, list[str]]:
     camera = float(1 / wide), float(1 / tall), float(-left / wide), float(-top / tall)
     depth = torch.full((len(rows), 1, 1), FAR_M)
     views = PosedViews(torch.stack([pictures[k] for k in rows]), depth, shots.pose[rows], camera)
-    return views, [shots.files[k].name for k, bad in enumerate(out) if bad]
+    return views, [shown_name(shots.files[k]) for k, bad in enumerate(out) if bad]
 
 
 def _as_taken(file: Path, lens: Lens, longest: int) -> np.ndarray:

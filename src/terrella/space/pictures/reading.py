@@ -13,6 +13,7 @@ from ..files.ply import full_scale
 ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 VIDEOS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v")
 SMALLEST, MOST_PIXELS = 32, 100_000_000
+PLAIN = 2.0  # standard deviation of colours in 0..255: less shows nothing
 BLURRED = 0.4  # of the usual sharpness of a set: less is left out
 
 
@@ -37,6 +38,8 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is not there; check its name.") from error
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        if "truncated" in str(error).lower():
+            raise DatasetError(f"{path} is incomplete: the file ends before the picture does. Copy it again.") from error
         raise DatasetError(f"{path} cannot be read as a picture; save it as JPEG or PNG.") from error
     picture = _rgb(picture)
     share = longest / max(picture.size)
@@ -45,13 +48,27 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
     return np.asarray(picture)
 
 
+def opaque_part(path: Path, size: tuple[int, int]) -> np.ndarray | None:
+    """Which pixels of a readable picture are opaque: bool [H, W] of that size, upright; None if it has no transparency."""
+    with Image.open(path) as opened:
+        if not opened.has_transparency_data:
+            return None
+        alpha = ImageOps.exif_transpose(opened).convert("RGBA").getchannel("A")
+    return np.asarray(alpha.resize(size[::-1], Image.Resampling.BOX)) >= 128
+
+
+def is_plain(picture: np.ndarray) -> bool:
+    """Whether a picture uint8 [H, W, 3] is of one colour, as of a covered lens."""
+    return float(picture.std(axis=(0, 1)).max()) < PLAIN
+
+
 def _rgb(picture: Image.Image) -> Image.Image:
     """Any mode as RGB: 16 bits and floats by their full scale, transparency on black."""
     if picture.mode.startswith(("I", "F")):
         numbers = np.nan_to_num(np.asarray(picture), posinf=0, neginf=0)
         most = full_scale(numbers.dtype, float(numbers.max()))
         picture = Image.fromarray((numbers.clip(0, most) * (255 / most)).round().astype(np.uint8))
-    if "A" in picture.mode or "transparency" in picture.info:
+    if picture.has_transparency_data:
         clear = picture.convert("RGBA")
         picture = Image.alpha_composite(Image.new("RGBA", clear.size, (0, 0, 0, 255)), clear)
     return picture.convert("RGB")
