@@ -415,7 +415,15 @@ def test_copies_are_named_as_their_sources():
 
 
 def test_a_poor_fit_is_called_poor(monkeypatch):
-    facts = {"gaussians": 9, "pictures": 9, "seconds": 1, "held_out": 3, "world": "w", "collider": "open", "left_out": []}
+    facts = {
+        "gaussians": 9,
+        "pictures": 9,
+        "seconds": 1,
+        "held_out": 3,
+        "world": "w",
+        "collider": "open",
+        "left_out": [],
+    }
     for ours, copied, poor in ((14.7, 13.6, True), (24, 23, True), (24, 15, False)):
         both = {"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]}
         monkeypatch.setattr(build_space, "fit_splat", lambda *_: facts | both)

@@ -193,7 +193,9 @@ def _doubts_of_colours(colours: torch.Tensor) -> list[str]:
     if bright < DARK and contrast > 0:
         return [f"the picture is dark (its brightest pixel has {bright:.0%} of white): brighten it and lift it again."]
     if contrast < PLAIN:
-        return [f"the picture is plain (contrast {contrast:.3f}; below {PLAIN} nothing shows depth): the place is a guess."]
+        return [
+            f"the picture is plain (contrast {contrast:.3f}; below {PLAIN} nothing shows depth): the place is a guess."
+        ]
     steps = (63 * colours).round().long()
     share = float(((steps[0] * 64 + steps[1]) * 64 + steps[2]).bincount().max() / steps.shape[1])
     if share > ONE_COLOUR:
@@ -229,7 +231,9 @@ def _frames(picture: Path) -> list[str]:
             f"`{command('terrella', 'space', 'fit', picture, out=f'{folder_name(picture.stem)}-place')}` makes one place."
         )
     if not picture.exists():
-        raise DatasetError(f"{picture} does not exist; check the path (of words, `terrella space build` makes a place).")
+        raise DatasetError(
+            f"{picture} does not exist; check the path (of words, `terrella space build` makes a place)."
+        )
     if picture.is_dir():
         raise DatasetError(f"{picture} is a folder without pictures; give a picture, or a folder of them to space fit.")
     try:

@@ -39,7 +39,9 @@ def read_picture(path: Path, upright: bool = True, longest: int = 4096) -> np.nd
         raise DatasetError(f"{path} is not there; check its name.") from error
     except (OSError, ValueError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
         if "truncated" in str(error).lower():
-            raise DatasetError(f"{path} is incomplete: the file ends before the picture does. Copy it again.") from error
+            raise DatasetError(
+                f"{path} is incomplete: the file ends before the picture does. Copy it again."
+            ) from error
         raise DatasetError(f"{path} cannot be read as a picture; save it as JPEG or PNG.") from error
     picture = _rgb(picture)
     share = longest / max(picture.size)
