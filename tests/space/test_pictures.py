@@ -426,7 +426,7 @@ def test_a_poor_fit_is_called_poor(monkeypatch):
     }
     for ours, copied, poor in ((14.7, 13.6, True), (24, 23, True), (24, 15, False)):
         both = {"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]}
-        monkeypatch.setattr(build_space, "fit_splat", lambda *_: facts | both)
+        monkeypatch.setattr(build_space, "fit_splat", lambda *_, both=both: facts | both)
         assert any("poor" in line for line in build_space.fit_space("a", "b", SplatFit()).lines) == poor
 
 

@@ -85,9 +85,9 @@ def fit_space(
     ]
     if ours < max(POOR_DB, copied + LITTLE_DB):
         lines.append(
-            f"poor: pictures that were not fitted are met by {ours:.1f} dB (good places reach {POOR_DB:.0f} and more, {LITTLE_DB:.0f} "
-            "above the nearest picture): more --steps and --gaussians may mend it, or things moved between the pictures, or "
-            "their poses are wrong."
+            f"poor: held-out pictures are met by {ours:.1f} dB (good places reach {POOR_DB:.0f} or more, and {LITTLE_DB:.0f} above "
+            "the nearest picture): more --steps and --gaussians may mend it, or things moved between the pictures, or their "
+            "poses are wrong."
         )
     if left_out := facts["left_out"]:
         more = f", and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""

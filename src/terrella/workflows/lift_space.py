@@ -175,7 +175,8 @@ def doubts(layers: PictureLayers) -> list[str]:
     notes = _doubts_of_colours(layers.rgb[:, shown])
     if not notes and far / near < FLAT:
         notes.append(
-            f"the picture shows little depth (its far parts are {far / near:.2f} times as far as its near ones): a wall, a logo or text?"
+            f"the picture shows little depth (its far parts are {far / near:.2f} times as far as its near ones): a wall, a "
+            "logo or text?"
         )
     if _is_round(layers.rgb):
         notes.append("the picture is round, as a fisheye's: straight lines come out bent; rectify it before.")

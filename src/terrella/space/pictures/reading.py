@@ -56,7 +56,7 @@ def opaque_part(path: Path, size: tuple[int, int]) -> np.ndarray | None:
         if not opened.has_transparency_data:
             return None
         alpha = ImageOps.exif_transpose(opened).convert("RGBA").getchannel("A")
-    return np.asarray(alpha.resize(size[::-1], Image.Resampling.BOX)) >= 128
+    return np.asarray(alpha.resize((size[1], size[0]), Image.Resampling.BOX)) >= 128
 
 
 def is_plain(picture: np.ndarray) -> bool:
