@@ -351,7 +351,7 @@ def wrong_poses(folder, doc):
         (unknown_model, "ORTHOPHOTO"),
         (all_lost, "none of its 20 pictures is there, such as 000.png"),
         (some_lost, "7 posed pictures (left out: 003.png (absent), 004.png (absent)"),
-        (no_picture, "003.png is incomplete"),
+        (no_picture, "003.png cannot be read as a picture"),
         (cut, "003.png is incomplete"),
         (tiny, "003.png is 5 x 5 pixels"),
         (other_shape, "003.png is 90 x 40"),
