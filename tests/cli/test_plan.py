@@ -16,6 +16,7 @@ from terrella.cli import main
 from terrella.core.errors import TerrellaError
 from terrella.sim.randomised import Randomised
 from terrella.workflows.opening import EnvironmentConfig
+from terrella.workflows.plan_energy import DECISIONS
 from terrella.workflows.plan_study import PlanConfig, open_study
 from terrella.workflows.progress import silent
 from terrella.workflows.real_environment import open_copied, open_real, refuse_randomised
@@ -147,6 +148,38 @@ def test_the_printed_command_evaluates_the_same_search_towards_the_same_goal(cap
     assert "plan:search=tree,samples=6,iterations=2,horizon=4" in evaluated["names"].values()
 
 
+@pytest.mark.parametrize(
+    "watts, samples, iterations, said",
+    [
+        (2000, 32, 4, ""),
+        (640, 16, 4, "searches 16 of 32 plans a round"),
+        (40, 2, 2, "searches 2 of 32 plans a round and 2 of 4 rounds"),
+        (5, 2, 1, "cannot be kept: it takes 20 W"),
+    ],
+)
+def test_a_budget_of_watts_takes_plans_and_then_rounds(watts, samples, iterations, said, monkeypatch, tmp_path):
+    """A joule for each plan of a round; at one decision each 0.1 s 32 plans in 4 rounds are 1,280 W."""
+    joules = lambda policy, *_: (float(policy.config.samples * policy.config.iterations), None)  # noqa: E731
+    monkeypatch.setattr("terrella.workflows.plan_energy._measured", joules)
+    search, lines = terrella.SearchConfig(samples=32, iterations=4, horizon=4), list[str]()
+    study = open_study(BLIND, PlanConfig("20", within=0.001, watts=watts, search=search, out=tmp_path), lines.append)
+    assert (study.search.samples, study.search.iterations) == (samples, iterations)
+    assert said in "".join(lines) and bool(said) == bool(lines)
+    assert study.decision is not None and study.decision.kept == ("cannot" not in said)
+
+
+def test_the_energy_of_a_decision_is_told_beside_its_time(capsys, tmp_path):
+    found = planned(capsys, BLIND, "--goal", "20", "--no-curve", *QUICK, "--out", str(tmp_path))
+    assert found["decision_joules"] > 0 and found["decision_watts"] == pytest.approx(10 * found["decision_joules"])
+    assert found["futures_bytes"] > 0 and "watts" not in found
+
+
+@pytest.mark.parametrize("extra", [["--watts", "0"], ["--watts", "5", "--agent", "random"]])
+def test_watts_that_nothing_keeps_are_refused(extra, capsys, tmp_path):
+    assert main(["plan", BLIND, "--goal", "20", *QUICK, *extra, "--out", str(tmp_path)]) == 2
+    assert "--watts" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["--cost", "last"], ["--proposal", "constant:2"]])
 def test_no_command_is_printed_where_evaluate_has_no_such_search(words, capsys, tmp_path):
     goal = ["--goal", "20", "--within", "0.001"]
@@ -182,7 +215,7 @@ def test_a_plan_that_is_stopped_shows_how_far_it_came_beside_as_many_random_step
 
     def stopped(planner, *given):
         calls.append(1)
-        if len(calls) > 3:
+        if len(calls) > 3 + 1 + DECISIONS:  # those whose energy is measured come first
             raise KeyboardInterrupt
         return act(planner, *given)
 

@@ -65,8 +65,8 @@ class Costs:
 
     def summary(self) -> str:
         pace, label = 1e3 / self.frame_ms, "estimated" if self.energy.startswith("estimated") else "measured"
-        own, shared = _in_words(self.session_bytes), _in_words(self.shared_bytes)
-        grows = "flat" if self.flat else f"grows by {_in_words(self.added_bytes)} per minute of play"
+        own, shared = bytes_in_words(self.session_bytes), bytes_in_words(self.shared_bytes)
+        grows = "flat" if self.flat else f"grows by {bytes_in_words(self.added_bytes)} per minute of play"
         rows = [["a frame, as a person plays", f"{self.frame_ms:.3g} ms", f"{self.frame_joules:.3g} J"]]
         for one in self.imagined:
             what = "of one rollout" if one.batch == 1 else f"of one of {one.batch:,} rollouts"
@@ -125,5 +125,5 @@ def costs_of(mine: World, name: str, config: CostsConfig, progress: Progress = s
     )  # fmt: skip
 
 
-def _in_words(size: float) -> str:
+def bytes_in_words(size: float) -> str:
     return f"{size / 2**20:.3g} MiB" if abs(size) >= 2**20 else f"{size / 2**10:.3g} KiB"

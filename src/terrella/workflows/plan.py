@@ -23,7 +23,7 @@ def plan(
     if config.skills is not None:
         return plan_with_skills(name, config, progress=progress)
     if config.agent:
-        refuse(config, f"{config.agent} acts in place of the search", "cost", "proposal", *vars(config.search))
+        refuse(config, f"{config.agent} acts in place of the search", "cost", "proposal", "watts", *vars(config.search))
     study = open_study(name, config, progress)
     folder = Path(config.out or f"plans/{folder_name(name)}")
     played = study.run()
@@ -33,4 +33,5 @@ def plan(
     acting = {name: getattr(config, name) for name in ("cost", "proposal", "agent") if getattr(config, name)}
     counts = {"steps": study.steps, "episodes": config.episodes, "seed": config.seed}
     settings = {**about, **search, **acting, **counts, "solved_starts_left_out": played.planner.skipped}
+    settings |= study.decision.facts() if study.decision else {}
     return save_result(study, played, settings, folder)

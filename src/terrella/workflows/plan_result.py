@@ -111,6 +111,7 @@ def _lines(
     if ms := planner.get("ms a decision"):
         imagined = f" for {planner['steps imagined'].value:,.0f} imagined steps" if "steps imagined" in planner else ""
         lines.append(f"a decision takes {ms.value:.0f} ms (95% within {ms.high:.0f}){imagined}")
+    lines += study.decision.lines() if study.decision else []
     if skipped := played.planner.skipped:
         lines.append(f"{skipped} starts were already solved and left out")
     if (study.goal or study.places) and planner.get("success") and not planner["success"].value and not played.cut:

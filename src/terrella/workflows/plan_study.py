@@ -1,6 +1,6 @@
 """What `plan` plays: the worlds, opened and checked, and the planner in them."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,6 +24,7 @@ from ..act.planning import (
     play,
 )
 from ..act.planning.episodes import PlayInterrupted
+from ..act.planning.routes import NoRoute
 from ..act.policies_by_name import policy_of, proposal_policy
 from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, Random
@@ -34,7 +35,8 @@ from .compute_curve import CurvePoint, compute_of, figures_of, halved
 from .goals import REWARD, read_goal
 from .opening import Device, EnvironmentConfig, device_of, load_named
 from .place_goals import WALK_S, PlaceGoals, is_recording, views_of, walking_defaults
-from .progress import Progress, stage
+from .plan_energy import DecisionCost, priced
+from .progress import Progress, stage, stopping_with
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 from .trust import search_within_trust
 
@@ -66,6 +68,9 @@ class PlanConfig:
     skills: Path | None = None
     """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills. Without --goal
     each episode has the environment's own instruction."""
+    watts: float | None = None
+    """Power that planning may take, in watts, at one decision each --replan moves: fewer plans are searched to keep it, and the
+    result says how many. Without an energy counter that may be read, watts are estimated from processor time."""
     rollouts: int = 0
     """With --skills: rollouts in the world of each of the four likeliest plans, to choose among them. Default: 0, none."""
     real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
@@ -105,6 +110,7 @@ class PlanStudy:
     steps: int
     progress: Progress
     places: PlaceGoals | None = None
+    decision: DecisionCost | None = None  # None for an agent, which does not search.
 
     @property
     def within(self) -> float:
@@ -244,7 +250,21 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
     if config.agent is None:
         search = search_within_trust(world, search, progress)
         planner_of(world, goal, config, search)  # refuses what does not fit, before anything is played
-    return PlanStudy(config, search, world, real, goal, _criterion(config, goal, real.spec), limit or STEPS, progress)
+    study = PlanStudy(config, search, world, real, goal, _criterion(config, goal, real.spec), limit or STEPS, progress)
+    return study if config.agent else _priced(study, lambda one: planner_of(world, goal, config, one))
+
+
+def _priced(study: PlanStudy, policy: Callable[[SearchConfig], Policy]) -> PlanStudy:
+    """The study with what a decision costs, and a search that keeps --watts. A route that is not known costs nothing."""
+    config, cuda = study.config, device_of(study.config.device).startswith("cuda")
+    try:
+        with stopping_with("stopped before the first decision."):
+            search, cost = priced(study.search, config.watts, policy, study.real, study.sees, cuda, config.seed)
+    except NoRoute:
+        return study
+    for line in cost.lines()[1:]:
+        study.progress(line)
+    return replace(study, search=search, decision=cost)
 
 
 def _open_walk(
@@ -256,7 +276,8 @@ def _open_walk(
         raise TerrellaError(f"--apart is more than the {places.within_m:g} m within which a view is reached.")
     search = config.search.filled(**walking_defaults(world.spec))
     walker(world, search, Destination(views[0]))  # refuses what does not fit, before anything is played
-    return PlanStudy(config, search, world, real, {}, SuccessCriterion(), steps, progress, places)
+    study = PlanStudy(config, search, world, real, {}, SuccessCriterion(), steps, progress, places)
+    return _priced(study, lambda one: walker(world, one, Destination(views[0])))
 
 
 def _criterion(config: PlanConfig, goal: Mapping[str, torch.Tensor], real: Spec) -> SuccessCriterion:
