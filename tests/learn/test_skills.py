@@ -23,7 +23,7 @@ from terrella.core.world import make_rng
 from terrella.data import record
 from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
-from terrella.learn.recipes.skills import Segments, lasting
+from terrella.learn.recipes.skills import Segments, SkillRows, lasting
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
 
@@ -166,6 +166,20 @@ def test_an_instruction_is_over_when_it_has_looked_done_for_long_enough(library)
             state, at = world.imagine(state, action, rng), at + 1
         steps.append(at)
     assert steps[1] == steps[0] + 2 < 30
+
+
+def test_a_batch_that_the_memory_does_not_hold_is_halved(library, monkeypatch, tmp_path):
+    sample = SkillRows.sample
+
+    def short(rows: SkillRows, count: int, rng: np.random.Generator):
+        if count > 12:
+            raise MemoryError
+        return sample(rows, count, rng)
+
+    monkeypatch.setattr(SkillRows, "sample", short)
+    with pytest.warns(UserWarning, match="training goes on") as warned:
+        assert learned((tmp_path, *library[1:])) == 0
+    assert [str(one.message).split("halved to ")[1].split(",")[0] for one in warned] == ["16", "8"]
 
 
 def test_a_skill_is_renamed_tried_and_listed(library, capsys):

@@ -23,6 +23,7 @@ from ..demonstrations import DemonstrationRows
 from ..feeds import RandomBatches
 from ..objectives.skills import SkillMoments, SkillPrediction, recalled_moments
 from ..recording import Recording
+from ..sized_feed import SizedFeed
 from ..trainer import Report, Run, Trainer
 
 STAGE = "skills"
@@ -158,7 +159,7 @@ def learn_skills(
     picks = [np.flatnonzero(segments.held_out == held) for held in (False, True)]
     features = SegmentFeatures.of(network, rows, segments, report)
     train, test = (SkillRows(rows, segments, features, network.words.read(tasks), pick) for pick in picks)
-    feed = RandomBatches(lambda now: train.sample(config.batch, now.rng))
+    feed = SizedFeed(lambda size: RandomBatches(lambda now: train.sample(size, now.rng)), config.batch)
     trainer = Trainer(run, STAGE, feed, SkillPrediction(network, predictor, config.learning_rate), config.steps)
     trainer.train(lambda: None)
     card = {"what": f"Skills of {recording.name}", "learned_from": recording.name}
