@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import threading
+import time
+import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +81,26 @@ def test_files_that_the_page_asks_for(folder):
             exported_file(str(folder), wrong)
 
 
+def test_a_film_ends_when_nobody_waits_for_it(folder, serving):  # noqa: F811
+    with pytest.raises(TerrellaError, match="stopped"):
+        exported_file(str(folder), {"kind": "mp4", "path": PATH, "seconds": 9, "exposure": 0}, lambda: True)
+    ended = threading.Event()
+
+    def export(wish, gone):
+        for _ in range(300):
+            if gone():
+                ended.set()
+                break
+            time.sleep(0.05)
+        return b"film"
+
+    url = serving(build_place(replace(editable_place(str(folder)), export=export)))
+    wish = json.dumps({"kind": "mp4", "key": editable_place(str(folder)).key}).encode()
+    with pytest.raises(TimeoutError):
+        urllib.request.urlopen(urllib.request.Request(url + "files", data=wish), timeout=1)
+    assert ended.wait(10)
+
+
 def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # noqa: F811
     page = opened(serving(build_place(editable_place(str(folder)))), size=(500, 360))
     for x, heading in ((1.0, 3.0), (2.0, -3.0), (3.0, 0.5)):
@@ -98,6 +122,11 @@ def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # no
         with page.expect_download() as download:
             page.click(f"[data-file={kind}]")
         assert download.value.suggested_filename == f"a-room.{kind}"
+    page.fill("[data-film=seconds]", "1e9")
+    page.click("[data-file=mp4]")
+    assert page.input_value("[data-film=seconds]") == "120"
+    page.click("[data-file=mp4]")
+    until(page, "document.querySelector('[data-film=state]').textContent === 'The film was stopped.'")
     page.focus("[data-film=exposure]")  # keys still walk
     page.keyboard.down("KeyA")
     until(page, "Math.hypot(...terrella.walker.speed) > 0")

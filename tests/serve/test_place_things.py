@@ -184,9 +184,36 @@ def test_words_that_name_nothing_and_spots_that_are_none_are_refused(tmp_path, o
     assert not (tmp_path / "w" / "things").exists()
 
 
+def drag(page) -> None:
+    """Drags from beside the middle of the page (900 x 500) to the right."""
+    page.mouse.move(600, 250)
+    page.mouse.down()
+    for x in (620, 650, 690):
+        page.mouse.move(x, 252)
+    page.mouse.up()
+
+
+def test_who_looks_around_with_the_object_tool_selects_nothing(tmp_path, opened, serving):  # noqa: F811
+    save_splat(world(1500), tmp_path / "w")
+    page = opened(serving(build_place(editable_place(str(tmp_path / "w")))), size=(900, 500))
+    page.keyboard.press("KeyE")
+    heading = page.evaluate("terrella.eye.heading")
+    drag(page)
+    assert page.evaluate("terrella.eye.heading") != heading
+    chosen = "!!terrella.editor.chosen || !!document.getElementById('toast').textContent"
+    assert not page.evaluate(chosen)
+    page.mouse.click(600, 250)
+    assert page.evaluate(chosen)
+    page.evaluate("terrella.editor.choose({ object: 1 }); terrella.editor.act({ do: 'delete' })")
+    (tmp_path / "empty.jsonl").write_text("\n")
+    page.set_input_files("#open", str(tmp_path / "empty.jsonl"))
+    until(page, "document.getElementById('toast').textContent.includes('no edits in empty.jsonl')")
+    assert page.evaluate("terrella.story.edits.length") == 1
+
+
 def test_the_view_turns_around_what_is_selected(tmp_path, opened, serving):  # noqa: F811
     save_splat(world(1500), tmp_path / "w")
-    page = opened(serving(build_place(editable_place(str(tmp_path / "w")))))
+    page = opened(serving(build_place(editable_place(str(tmp_path / "w")))), size=(900, 500))
     page.keyboard.press("KeyE")
     page.evaluate("terrella.editor.choose({ object: 1 })")
     page.keyboard.press("KeyO")
@@ -198,8 +225,14 @@ def test_the_view_turns_around_what_is_selected(tmp_path, opened, serving):  # n
     )
     page.evaluate("document.getElementById('view').dispatchEvent(new WheelEvent('wheel', { deltaY: -300 }))")
     assert page.evaluate(far) < before
+    page.evaluate("terrella.editor.choose({ all: true })")
+    heading = page.evaluate("terrella.eye.heading")
+    drag(page)  # on what is selected: it turns the view, and moves nothing
+    assert page.evaluate("terrella.story.edits.length") == 0 and page.evaluate("terrella.eye.heading") != heading
     page.keyboard.down("KeyW")
     page.keyboard.up("KeyW")
+    drag(page)
+    assert page.evaluate("terrella.story.edits.length") == 1
     assert not page.evaluate("terrella.orbit.on") and page.get_attribute("#orbit", "aria-pressed") == "false"
 
 

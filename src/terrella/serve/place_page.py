@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import gzip
 import hashlib
@@ -39,6 +40,8 @@ WHOLE = 150_000  # a place of at most this many Gaussians is sent in one part
 FIRST = 50_000  # of a larger place this many, spread evenly, are sent first; the page shows them while the rest arrives
 LONGEST_EDITS = 1 << 22  # bytes
 LONGEST_WISH = 1 << 14  # bytes of a request for things or for a file
+WATCH_S = 0.3  # between two looks whether a page still waits
+Gone = Callable[[], bool]  # whether nobody waits for an answer any longer
 _IMPORT = re.compile(r"^import \{ (.+) \} from '\./(\w+)\.js';\n", re.M)
 _OWN = re.compile(r"things/[\w-]+")  # a thing that was put into this place, perhaps before the server was started anew
 _EXPORT = re.compile(r"^export ((?:async )?(?:class|function|const) (\w+))", re.M)
@@ -249,7 +252,7 @@ class EditablePlace:
     beside: PlaceScene | None = None  # a place to compare it with
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
     put: Callable[[str, Spot], PutThings] | None = None  # builds what words name; may raise a TerrellaError
-    export: Callable[[Mapping[str, Any]], bytes] | None = None  # writes a file; may raise a TerrellaError
+    export: Callable[[Mapping[str, Any], Gone], bytes] | None = None  # writes a file; may raise a TerrellaError
     key: str = ""  # tells its page's requests from those of a page whose place the server showed before
 
 
@@ -260,7 +263,7 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
     writing = threading.Lock()  # one file at a time, while edits go on
 
-    def save(content: bytes) -> None:
+    def save(content: bytes, _: Gone) -> None:
         posted_edits = _wished(place, content)
         with lock:
             if [json.loads(line) for line in posted_edits["saved"].splitlines() if line] != list(place.edits()):
@@ -268,19 +271,19 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
             _edits_of(page, posted_edits["lines"])
             place.save(posted_edits["lines"])
 
-    def write_file(content: bytes) -> bytes:
+    def write_file(content: bytes, gone: Gone) -> bytes:
         wish = _wished(place, content)
         assert place.export is not None
         with writing:
-            return place.export(wish)
+            return place.export(wish, gone)
 
-    def build_things(content: bytes) -> bytes:
+    def build_things(content: bytes, _: Gone) -> bytes:
         wish = _wished(place, content)
         assert place.put is not None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
 
-    def close(content: bytes) -> bytes:
+    def close(content: bytes, _: Gone) -> bytes:
         edits, after = _edits_of(page, _wished(place, content)["lines"]), scene.collider_after
         assert after is not None
         with lock:
@@ -320,19 +323,34 @@ def _wished(place: EditablePlace, content: bytes) -> Mapping[str, Any]:
     return wish
 
 
-def _posting(work: Callable[[bytes], bytes | None], most: int, form: str) -> Callable[[Request], Awaitable[Response]]:
+def _posting(
+    work: Callable[[bytes, Gone], bytes | None], most: int, form: str
+) -> Callable[[Request], Awaitable[Response]]:
     """Answers POSTs with what `work` makes of a body of `most` bytes at most; a sentence where it cannot. form: what a body is."""
 
     async def answer(request: Request) -> Response:
+        gone, watch = threading.Event(), None
         try:
-            content = await run_in_threadpool(work, await posted(request, most))
+            body = await posted(request, most)
+            watch = asyncio.create_task(_watch(request, gone))
+            content = await run_in_threadpool(work, body, gone.is_set)
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
             return PlainTextResponse(f"{form}; reload the page.", 422)
         except TerrellaError as error:
             return PlainTextResponse(str(error), 422)
+        finally:
+            if watch is not None:
+                watch.cancel()
         return Response(content or b"", media_type="application/json" if content else "text/plain")
 
     return answer
+
+
+async def _watch(request: Request, gone: threading.Event) -> None:
+    """Sets `gone` once the page that asked is closed, or has stopped waiting."""
+    while not await request.is_disconnected():
+        await asyncio.sleep(WATCH_S)
+    gone.set()
 
 
 def serve_place(

@@ -4,7 +4,7 @@ import io
 import json
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -70,8 +70,11 @@ class ExportSpaceConfig:
     """Viewpoint of a panorama (.png): x y z in metres; its middle looks along x. Default: the first start and its heading."""
 
 
-def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResult:
-    """Writes a world of Gaussians to `file`, whose ending decides the format. The file is replaced as a whole."""
+def export_space(
+    world: str, file: Path, config: ExportSpaceConfig, gone: Callable[[], bool] = lambda: False
+) -> SpaceResult:
+    """Writes a world of Gaussians to `file`, whose ending decides the format. The file is replaced as a whole. gone: whether
+    nobody waits for a film any longer, which ends it with a TerrellaError."""
     suffix = file.suffix.lower()
     for field in fields(config):
         if getattr(config, field.name) != field.default and suffix not in OPTIONS[field.name]:
@@ -85,7 +88,7 @@ def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResu
         scene = unedited_scene(world)
         content, facts = PlacePage(scene).html(read_edits(folder_of(world))), {"gaussians": len(scene.gaussians)}
     elif suffix in (".glb", ".png", ".mp4"):
-        content, facts = _drawn(open_splat(world), suffix, config)
+        content, facts = _drawn(open_splat(world), suffix, config, gone)
     else:
         shown = _opaque(open_splat(world).gaussians)
         write_scene(shown, file, config.axes, "compressed" if config.compressed else "", config.spz)
@@ -95,7 +98,7 @@ def export_space(world: str, file: Path, config: ExportSpaceConfig) -> SpaceResu
     return SpaceResult({**facts, "bytes": file.stat().st_size, "file": str(file)})
 
 
-def exported_file(world: str, wish: Mapping[str, Any]) -> bytes:
+def exported_file(world: str, wish: Mapping[str, Any], gone: Callable[[], bool] = lambda: False) -> bytes:
     """The content of a file that the page of a place asks for: {"kind": one of EXPORTS, and of a film "path", "seconds" and
     "exposure"}. TerrellaError for what cannot be written."""
     kind = wish.get("kind")
@@ -110,7 +113,7 @@ def exported_file(world: str, wish: Mapping[str, Any]) -> bytes:
                 raise TerrellaError(f"a film has seconds, {LONGEST_S} at most, and an exposure in stops.")
             path.write_text(json.dumps(wish.get("path")))
             config = ExportSpaceConfig(seconds=seconds, path=path, aspect=16 / 9, exposure=exposure)
-        export_space(world, file, config)
+        export_space(world, file, config, gone)
         return file.read_bytes()
 
 
@@ -119,7 +122,9 @@ def _opaque(gaussians: Gaussians) -> Gaussians:
     return gaussians.at(gaussians.opacities > 0)
 
 
-def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[bytes, Mapping[str, Any]]:
+def _drawn(
+    world: SplatWorld, suffix: str, config: ExportSpaceConfig, gone: Callable[[], bool]
+) -> tuple[bytes, Mapping[str, Any]]:
     """A mesh, a panorama or a film: the bytes of its file, and its figures."""
     if not len(world.gaussians):
         raise DatasetError(f"{world.name} has no Gaussian left; undo an edit.")
@@ -130,7 +135,7 @@ def _drawn(world: SplatWorld, suffix: str, config: ExportSpaceConfig) -> tuple[b
     with torch.no_grad():
         if suffix == ".glb":
             return _glb(world, config)
-        return _panorama(world, config) if suffix == ".png" else _film(world, config)
+        return _panorama(world, config) if suffix == ".png" else _film(world, config, gone)
 
 
 def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
@@ -165,7 +170,7 @@ def _panorama(world: SplatWorld, config: ExportSpaceConfig, height: int = 1024) 
     return buffer.getvalue(), {"size": [2 * height, height], "pose": [round(v, 3) for v in pose.tolist()]}
 
 
-def _film(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
+def _film(world: SplatWorld, config: ExportSpaceConfig, gone: Callable[[], bool]) -> tuple[bytes, dict[str, Any]]:
     if not 0.5 <= config.seconds <= 600:
         raise TerrellaError("--seconds is from 0.5 to 600.")
     count, height = round(config.seconds * FRAMES_PER_S), 480
@@ -176,6 +181,8 @@ def _film(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str
     camera = world.config.camera if config.aspect is None else (wide, wide * aspect, middle[0], middle[1])
     pictures = []
     for pose in poses:
+        if gone():
+            raise TerrellaError("the film was stopped.")
         seen = rasterise(world.gaussians, pose[None], camera, size).rgb[0]
         picture = _exposed(seen, config.exposure)
         pictures.append((simplejpeg.encode_jpeg(picture, quality=95, colorspace="RGB", colorsubsampling="444"),))

@@ -80,7 +80,7 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   });
   const compare = new Compare(redraw, drawingOn);
   const editor = new Editor(story, drawing, {
-    changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look,
+    changed: take, marked: (mask) => { drawing.mark(story.scene, mask); redraw(); }, redraw, eye: () => walker.eye, lens, say: toast, keep, look, orbits: () => orbit.on,
     solid: () => solid, body: world.body, put: world.things, command: world.command, key: world.key,
   });
 

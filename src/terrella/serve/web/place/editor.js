@@ -17,14 +17,14 @@ const SAID = {
 const MOVES = ' Drag what is selected to move it, with Shift up and down.';
 
 export class Editor {
-  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), solid(), body, say(text), keep(lines) -> promise, look(dx, dy); put,
+  /** on: changed(scene), marked(mask), redraw(), eye(), lens(), solid(), body, say(text), keep(lines) -> promise, look(dx, dy), orbits(); put,
    * command and key: the address that builds things, what starts its server, and what goes with a request. */
   constructor(story, drawing, on) {
     Object.assign(this, { story, drawing, on, chosen: null, mask: null, open: false });
     this.selecting = new Selecting({
       scene: () => story.scene, eye: on.eye, lens: on.lens, mask: () => this.mask, choose: (chosen) => this.choose(chosen), say: on.say,
       dabs: () => [...(this.chosen?.brush ?? [])], preview: (shift) => this.preview({ move: shift }), move: (by) => this.act({ do: 'move', by }),
-      spot: (way) => { this.put.choose(way); on.redraw(); }, write: () => $('put-words').focus(), look: on.look,
+      spot: (way) => { this.put.choose(way); on.redraw(); }, write: () => $('put-words').focus(), look: on.look, orbits: on.orbits,
     });
     this.gizmo = new Gizmo($('gizmo'), { eye: on.eye, lens: on.lens, preview: (change) => this.preview(change), act: (action) => this.act(action) });
     this.put = new Put($('putting'), {
@@ -145,8 +145,9 @@ export class Editor {
     if (!file) return;
     try {
       const edits = (await file.text()).split('\n').filter((line) => line.trim()).map((line) => JSON.parse(line));
+      if (!edits.length) throw new Error();
       this.change(() => this.story.replay(edits));
-    } catch { this.on.say(`${file.name} holds no edits for this place.`); }
+    } catch { this.on.say(`There are no edits in ${file.name}; choose a world.edits.jsonl.`); }
     $('open').value = '';
   }
 

@@ -46,7 +46,8 @@ export class Film {
       this.parts.exposure.value = Number(stops) || 0;
       this.expose();
     } catch { /* nothing kept, or a browser that keeps nothing */ }
-    this.parts.seconds.onchange = this.parts.exposure.onchange = () => this.keep();
+    this.parts.exposure.onchange = () => this.keep();
+    this.parts.seconds.onchange = () => { this.parts.seconds.value = this.seconds; this.keep(); };
   }
 
   keep() {
@@ -61,7 +62,7 @@ export class Film {
 
   get stops() { return Number(this.parts.exposure.value); }
 
-  get seconds() { return Math.min(120, Math.max(1, Number(this.parts.seconds.value) || 8)); }
+  get seconds() { return Math.min(120, Math.max(1, Number.isNaN(parseFloat(this.parts.seconds.value)) ? 8 : parseFloat(this.parts.seconds.value))); }
 
   add() {
     if (this.views.length >= MOST) { this.on.say(`A path has ${MOST} views at most.`); return; }
@@ -111,23 +112,25 @@ export class Film {
   }
 
   async download(kind, button) {
+    if (kind === 'mp4' && this.filming) { this.filming.abort(); return; }
     if (kind !== 'png' && this.on.unsaved()) { this.on.say('Files are of the saved place; save the edits first.'); return; }
     if (kind === 'mp4' && this.views.length < FEWEST) { this.on.say('A film needs a path: keep two views or more (K).'); return; }
     const degrees = (angle) => round((angle * 180) / Math.PI), path = this.path.map(([x, y, z, heading, pitch]) => [...[x, y, z].map(round), degrees(heading), degrees(pitch)]);
     const wish = { kind, key: this.on.key, ...(kind === 'mp4' && { path, seconds: this.seconds, exposure: this.stops }) };
-    button.disabled = true;
-    this.parts.state.textContent = kind === 'mp4' ? `Drawing ${Math.round(30 * this.seconds)} pictures …` : `Writing the ${button.textContent} …`;
+    const stop = new AbortController();
+    if (kind === 'mp4') this.filming = stop; else button.disabled = true;
+    this.parts.state.textContent = kind === 'mp4' ? `Drawing ${Math.round(30 * this.seconds)} pictures … MP4 again stops it.` : `Writing the ${button.textContent} …`;
     try {
-      const blob = kind === 'png' ? await this.on.picture() : await (await reach(this.on.address + location.search, this.on.command, { method: 'POST', body: JSON.stringify(wish) })).blob();
+      const blob = kind === 'png' ? await this.on.picture() : await (await reach(this.on.address + location.search, this.on.command, { method: 'POST', body: JSON.stringify(wish), signal: stop.signal })).blob();
       const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(blob), download: `${this.on.name}.${ENDINGS[kind]}` });
       anchor.click();
       setTimeout(() => URL.revokeObjectURL(anchor.href), 10000);
       this.parts.state.textContent = `${anchor.download}: ${(blob.size / 1e6).toFixed(1)} MB`;
     } catch (error) {
-      this.parts.state.textContent = '';
-      this.on.say(error.message);
+      this.parts.state.textContent = stop.signal.aborted ? 'The film was stopped.' : '';
+      if (!stop.signal.aborted) this.on.say(error.message);
     }
-    button.disabled = false;
+    if (kind === 'mp4') this.filming = null; else button.disabled = false;
   }
 
   /** The path as lines. */

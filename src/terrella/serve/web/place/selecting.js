@@ -4,10 +4,11 @@ import { pick } from './pick.js';
 import { axes, ray } from './camera.js';
 
 const round = (value) => Math.round(value * 1000) / 1000, dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-const LEAST = 0.05;  // metres of a selection
+const LEAST = 0.05, CLICK = 6;  // metres of a selection; pixels that a click may move
 
 export class Selecting {
-  /** on: scene(), eye(), lens(), mask(), choose(selection), preview(shift), move(shift), say(text), spot(direction), write(), look(dx, dy). */
+  /** on: scene(), eye(), lens(), mask(), choose(selection), preview(shift), move(shift), say(text), spot(direction), write(), look(dx, dy),
+   * orbits() -> whether drags turn around what is selected. */
   constructor(on) { Object.assign(this, { on, tool: 'sphere', doing: null, radius: 0.25 }); }
 
   way(event) {
@@ -16,7 +17,10 @@ export class Selecting {
 
   handle(name, event) {
     if (name === 'down') return this.down(event);
-    if (name === 'drag' && this.doing?.does === 'nothing') this.on.look(event.movementX, event.movementY);
+    if (name === 'drag' && this.doing?.does === 'nothing') {
+      this.doing.looked = (this.doing.looked ?? 0) + Math.hypot(event.movementX, event.movementY);
+      this.on.look(event.movementX, event.movementY);
+    }
     else if (name === 'drag' && this.doing) this.drag(event);
     if (name === 'up' && this.doing) this.up();
     if (name === 'up' && this.tool === 'put') this.on.write();  // a press itself takes the focus away
@@ -30,12 +34,9 @@ export class Selecting {
     if (this.tool === 'put') {
       this.on.spot(way);
       this.doing = { does: 'nothing' };
-    } else if (this.on.mask()?.[hit.number] && !brushes) this.doing = { does: 'move', from, shift: [0, 0, 0] };
+    } else if (this.on.mask()?.[hit.number] && !brushes) this.doing = this.on.orbits() ? { does: 'nothing' } : { does: 'move', from, shift: [0, 0, 0] };
     else if (this.tool === 'object') {
-      const number = Math.max(0, this.on.scene().objects[hit.number]);
-      if (number) this.on.choose({ object: number });
-      else this.on.say('This belongs to no object; select it with a box, a sphere or the brush.');
-      this.doing = { does: 'nothing' };
+      this.doing = { does: 'nothing', object: Math.max(0, this.on.scene().objects[hit.number]) };  // who drags on looks around
     } else if (this.tool === 'plane') {
       this.on.choose({ plane: [0, 0, 1, round(from[2])] });
       this.doing = { does: 'nothing' };
@@ -61,8 +62,10 @@ export class Selecting {
   }
 
   up() {
-    const { does, shift } = this.doing;
+    const { does, shift, object, looked } = this.doing;
     this.doing = null;
+    if (object > 0 && !(looked > CLICK)) this.on.choose({ object });
+    else if (object === 0 && !(looked > CLICK)) this.on.say('This belongs to no object; select it with a box, a sphere or the brush.');
     if (does === 'move' && shift.some(Boolean)) this.on.move(shift);
   }
 
