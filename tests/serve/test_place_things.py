@@ -20,9 +20,9 @@ from terrella.space.layout.placing import FurnitureRequest
 from terrella.workflows.editable_place import editable_place
 from terrella.workflows.put_things import put_things
 from terrella.worlds.splat import SplatWorld
-from terrella.worlds.splat_folder import read_edits, save_splat, write_edits
+from terrella.worlds.splat_folder import load_source, read_edits, save_splat, write_edits
 
-from .test_place_page import opened, serving, until, world  # noqa: F401  (fixtures)
+from .test_place_page import opened, serving, until, walled_by, world  # noqa: F401  (fixtures)
 
 
 def test_words_name_things_to_put():
@@ -182,6 +182,29 @@ def test_words_that_name_nothing_and_spots_that_are_none_are_refused(tmp_path, o
         status, text = page.evaluate(post, json.dumps(body))
         assert status == 422 and sentence in text
     assert not (tmp_path / "w" / "things").exists()
+
+
+def test_what_is_put_on_the_page_stands_clear_of_walls_and_within_them(tmp_path, opened, serving):  # noqa: F811
+    walls = torch.tensor([[-0.2, -0.2, 0, 0, 4.2, 2.5], [-0.2, -0.2, 0, 4.2, 0, 2.5], [-0.2, -0.2, -0.2, 4.2, 4.2, 0]])
+    for name, made in (("boxes", walled_by(world(1500), walls)), ("cells", world(6000))):
+        save_splat(made, tmp_path / name)
+        page = opened(serving(build_place(editable_place(str(tmp_path / name)))), size=(900, 500))
+        page.keyboard.press("KeyN")
+        at = [0.1, 0.1, 0.0] if name == "boxes" else [0.15, 2.0, 0.0]
+        spot = {"at": at, "floor": 0, "wall": False, "degrees": 90, "ceiling": None}
+        page.evaluate("spot => { terrella.editor.put.spot = spot; }", spot)
+        page.fill("#put-words", "a crate")
+        page.press("#put-words", "Enter")
+        until(page, "terrella.story.edits.length === 1")
+        x, y, z = page.evaluate("terrella.story.edits[0].by")
+        page.keyboard.press("KeyN")
+        page.evaluate("spot => { terrella.editor.put.spot = spot; }", spot | {"wall": True, "at": [0.0, 2.0, 1.5]})
+        page.fill("#put-words", "a picture")
+        page.press("#put-words", "Enter")
+        until(page, "terrella.story.edits.length === 2")
+        assert not page.inner_text("#toast") and page.evaluate("terrella.story.edits[1].by[1]") == 2
+        half = 0.5 * load_source(tmp_path / name / page.evaluate("terrella.story.edits[0].place")).card["size"][0]
+        assert half - 0.1 < x < 0.95 and z == 0 and (y == 2 if name == "cells" else half - 0.1 < y < 0.95)
 
 
 def drag(page) -> None:

@@ -230,7 +230,10 @@ def test_a_picture_and_a_plan_become_places_in_folders_of_their_own(tmp_path, mo
 
 def test_a_picture_that_cannot_be_lifted_is_named_as_it_was_dropped(tmp_path):
     shelf = FolderShelf(tmp_path, PlayConfig(), ControlsConfig(), ServeConfig(), silent)
-    for name, sentence in (("a cat.png", "a-cat.png cannot be read"), ("film.mp4", "space fit film.mp4 makes")):
+    for name, sentence in (
+        ("a cat.png", "a-cat.png cannot be read"),
+        ("film.mp4", "space fit film.mp4 --out film-place` makes"),
+    ):
         with pytest.raises(ServeError, match=sentence) as failed:
             shelf.lift(name, b"pixels")
         assert tempfile.gettempdir() not in str(failed.value) and not (tmp_path / "places").exists()

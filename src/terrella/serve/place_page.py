@@ -101,10 +101,10 @@ class PlacePage:
     def add(self, put: PutThings) -> bytes:
         """Makes things known that the page may merge from now on; their merges and packed Gaussians, as JSON for put.js."""
         things = []
-        for edit, scene in zip(put.edits, put.scenes):
+        for edit, scene, stands in zip(put.edits, put.scenes, put.stands):
             about, packed = _packed_whole(scene)
             self.merged[_merge_key(edit)] = {**about, "sha256": edit["sha256"]}, packed
-            things.append({"edit": edit, "about": about, "data": packed})
+            things.append({"edit": edit, "about": about, "data": packed, "stands": stands})
         return json.dumps({"things": things, "unknown": put.unknown}).encode()
 
     def _collider_after(self, edits: Sequence[Edit]) -> dict[str, Any] | None:

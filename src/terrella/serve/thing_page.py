@@ -23,10 +23,11 @@ class Spot:
 
 @dataclass(frozen=True)
 class PutThings:
-    """Things that were put: the merges that add them, what each adds, and the words without effect."""
+    """Things that were put: the merges that add them, what each adds, which stand on a floor, and the words without effect."""
 
     edits: tuple[Edit, ...]
     scenes: tuple[PlaceScene, ...]
+    stands: tuple[bool, ...]
     unknown: tuple[str, ...]
 
 

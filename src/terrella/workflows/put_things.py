@@ -40,7 +40,8 @@ def put_things(folder: Path, words: str, spot: Spot) -> PutThings:
         middle = sum(merged["size"][0] + APART_M for merged, _ in row[: len(edits)]) + thing["size"][0] / 2
         edits.append(merge_edit(folder, home, _foot(thing, spot, middle - width / 2), spot.degrees))
     scenes = [page_scene(load_source(home, None), walked=False) for _, home in row]
-    return PutThings(tuple(edits), tuple(scenes), unknown)
+    stands = tuple(thing["stands"] not in ("hung", "ceiling") for thing, _ in row)
+    return PutThings(tuple(edits), tuple(scenes), stands, unknown)
 
 
 def _atmosphere(folder: Path) -> dict[str, str]:

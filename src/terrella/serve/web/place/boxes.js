@@ -19,6 +19,12 @@ export class Boxes {
     return most;
   }
 
+  /** Whether a box overlaps another one by more than `slack` metres. */
+  meets([x0, y0, z0, x1, y1, z1], slack) {
+    const over = (low, high, from, to) => low + slack < to && high - slack > from;
+    return this.boxes.some(([a, b, c, d, e, f]) => over(x0, x1, a, d) && over(y0, y1, b, e) && over(z0, z1, c, f));
+  }
+
   /** How high the floor under a body is: the highest top up to a step above its feet; its feet where there is none. */
   floor([x, y, z], { eye_m: eye, step_m: step }) {
     const feet = z - eye;

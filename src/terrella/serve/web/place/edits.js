@@ -103,7 +103,7 @@ function merged(scene, other, by, degrees) {
 }
 
 /** Boxes turned by quarter turns, then moved. */
-function placed(boxes, [dx, dy, dz], quarters) {
+export function placed(boxes, [dx, dy, dz], quarters) {
   const left = ([x0, y0, z0, x1, y1, z1]) => [-y1, x0, z0, -y0, x1, z1];
   for (let turn = 0; turn < ((quarters % 4) + 4) % 4; turn += 1) boxes = boxes.map(left);
   return boxes.map(([x0, y0, z0, x1, y1, z1]) => [x0 + dx, y0 + dy, z0 + dz, x1 + dx, y1 + dy, z1 + dz]);

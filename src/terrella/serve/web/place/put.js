@@ -2,10 +2,14 @@
 
 import { axesOf } from './draw.js';
 import { axes } from './camera.js';
+import { placed } from './edits.js';
 import { pick } from './pick.js';
 import { reach } from './reach.js';
 import { decoded, inflate, Reader, unpackScene } from './scene.js';
 
+const NEAR = 16, STEP = 0.05, SLACK = 0.02, TALL = 1.5;  // how far a thing makes way for walls and other things, in steps; metres
+const SHIFTS = Array.from({ length: (2 * NEAR + 1) ** 2 }, (_, k) => [(k % (2 * NEAR + 1)) - NEAR, Math.floor(k / (2 * NEAR + 1)) - NEAR])
+  .sort((one, other) => Math.hypot(...one) - Math.hypot(...other)).map((by) => by.map((part) => part * STEP));
 const UPRIGHT = 0.5, BEFORE = 0.3, AHEAD = 2, ABOVE = 0.3;
 
 /** What a ray from `eye` along `way` meets, as the server reads it: at, floor, ceiling, wall, degrees; metres. */
@@ -25,6 +29,19 @@ function normalOf(scene, k, way) {
   const thin = [0, 1, 2].reduce((least, a) => (scene.scales[3 * k + a] < scene.scales[3 * k + least] ? a : least), 0);
   const axis = axesOf(scene, k).slice(3 * thin, 3 * thin + 3), long = Math.hypot(...axis) || 1, side = axis[0] * way[0] + axis[1] * way[1] + axis[2] * way[2] > 0 ? -1 : 1;
   return axis.map((part) => (side * part) / long);
+}
+
+/** The shortest way over the floor towards the eye, not through walls, by which boxes come free of what stops walkers; null: none is short. */
+export function wayOut(solid, boxes, eye) {
+  if (!boxes.length) return [0, 0];
+  const meets = ([x0, y0, z0, x1, y1, z1], [dx, dy]) => solid.meets([x0 + dx, y0 + dy, z0, x1 + dx, y1 + dy, z1], SLACK);
+  const [x, y, z] = [0, 1, 2].map((a) => boxes.reduce((sum, box) => sum + (a < 2 ? (box[a] + box[a + 3]) / 2 : box[a]) / boxes.length, 0)), probe = [x - STEP, y - STEP, z, x + STEP, y + STEP, z + TALL];
+  const passes = (by) => {  // it may begin in a wall
+    const free = Array.from({ length: NEAR + 1 }, (_, k) => !meets(probe, by.map((part) => (part * k) / NEAR)));
+    return !free.slice(free.indexOf(true)).includes(false);
+  };
+  const nearer = ([dx, dy]) => dx * (eye[0] - x) + dy * (eye[1] - y) >= 0;
+  return SHIFTS.find((by) => nearer(by) && !boxes.some((box) => meets(box, by)) && (by.every((part) => !part) || passes(by))) ?? null;
 }
 
 export class Put {
@@ -47,11 +64,13 @@ export class Put {
       const body = JSON.stringify({ words, spot: this.spot, key: this.on.key }), answer = await reach(this.on.address + location.search, this.on.command, { method: 'POST', body });
       const { things, unknown } = await answer.json(), scenes = new Map();
       for (const { edit, about, data } of things) if (!scenes.has(edit.sha256)) scenes.set(edit.sha256, unpackScene(new Reader(await inflate(decoded(data))), about));
-      this.on.put(things.map(({ edit }) => edit), scenes);
+      const boxes = things.filter(({ stands }) => stands).flatMap(({ edit, about }) => placed(about.boxes, edit.by, edit.degrees / 90)), way = wayOut(this.on.solid(), boxes, this.on.eye().place);
+      this.on.put(things.map((thing) => (way && thing.stands ? { ...thing.edit, by: thing.edit.by.map((part, a) => Math.round(1000 * (part + (way[a] ?? 0))) / 1000) } : thing.edit)), scenes);
       this.spot = null;
       field.value = '';
       field.blur();
       if (unknown.length) this.on.say(`Not understood: ${unknown.join(', ')}.`);
+      else if (!way) this.on.say('It overlaps something, for nothing near is free; move it.');
     } catch (error) { this.on.say(error.message); }
     button.disabled = false;
   }

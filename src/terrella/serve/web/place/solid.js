@@ -87,6 +87,17 @@ export class Solid {
     return false;
   }
 
+  /** Whether a box that stands on a floor overlaps anything by more than `slack` metres. */
+  meets([x0, y0, z0, x1, y1, z1], slack) {
+    const { cell } = this;
+    for (let x = x0 + slack; x < x1; x += Math.min(cell, Math.max(x1 - slack - x, slack))) {
+      for (let y = y0 + slack; y < y1; y += Math.min(cell, Math.max(y1 - slack - y, slack))) {
+        for (let z = z0 + 2.5 * cell; z < z1; z += cell) if (this.holds(x, y, z)) return true;
+      }
+    }
+    return false;
+  }
+
   /** How high the floor under a body is: the highest surface up to a step above its feet; its feet where there is none. */
   floor([x, y, z], { eye_m: eye, step_m: step }) {
     const { cell } = this, feet = z - eye, deep = Math.ceil((DEEPEST + step) / cell), levels = [];

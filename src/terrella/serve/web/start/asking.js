@@ -9,7 +9,7 @@ export const address = (path) => (token ? `${path}${path.includes('?') ? '&' : '
 
 /** Posts to /start/PATH, and opens what comes of it. words: shown until the server says more. */
 export async function go(path, body, words) {
-  const began = performance.now(), show = (text, failed = false) => { cover.hidden = false; cover.classList.toggle('failed', failed); cover.firstElementChild.textContent = text.charAt(0).toUpperCase() + text.slice(1); };
+  const began = performance.now(), show = (text, failed = false) => { cover.hidden = false; cover.classList.toggle('failed', failed); cover.firstElementChild.textContent = text; };
   show(words);
   const poll = setInterval(async () => {
     const doing = await fetch(address('/start/progress')).then((answer) => (answer.ok ? answer.text() : ''), () => '');
