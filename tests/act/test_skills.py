@@ -158,7 +158,8 @@ def test_a_library_is_written_renamed_and_read(tmp_path):
     library.write(tmp_path)
     library.renamed("go to the _ _", "walk").tried("walk", 2, 0).write_names(tmp_path)
     read = SkillLibrary.load(tmp_path)
-    assert read.named("walk").tries == 100 and read.named("walk").works == pytest.approx(99 / 102)
+    assert read.named("walk").own_tries == 2 and read.named("walk").works == pytest.approx(2 * 99 / 100 / 4)
+    assert library.named("go to the _ _").works == pytest.approx(99 / 100), "as recorded"
     seen, texts = {"hand": torch.zeros(2, 1)}, ["go to the red key", "pick up the blue box"]
     assert torch.allclose(read.outlook(seen, texts).begins, library.outlook(seen, texts).begins)
     learned_again = library.named_as(tmp_path)

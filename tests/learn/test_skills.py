@@ -17,6 +17,7 @@ import terrella
 from terrella.act.imitation import load_imitation_network
 from terrella.act.skills.actor import SkillActor
 from terrella.act.skills.library import SkillLibrary
+from terrella.act.skills.search import SkillSearch
 from terrella.cli import main
 from terrella.core.errors import PlanningError
 from terrella.core.world import make_rng
@@ -166,6 +167,15 @@ def test_an_instruction_is_over_when_it_has_looked_done_for_long_enough(library)
             state, at = world.imagine(state, action, rng), at + 1
         steps.append(at)
     assert steps[1] == steps[0] + 2 < 30
+
+
+def test_what_the_recording_does_next_is_likelier_than_what_it_never_does_next(library):
+    """Errands alternate: after the red ball comes the blue one, and it always works."""
+    assert learned(library) == 0
+    search = SkillSearch(SkillLibrary.load(library[0]))
+    red, blue = (f"go to the {colour} ball" for colour in ("red", "blue"))
+    for one, other in ((red, blue), (blue, red)):
+        assert search.after(one, other).probability > 0.9 > 0.5 > search.after(one, one).probability
 
 
 def test_a_batch_that_the_memory_does_not_hold_is_halved(library, monkeypatch, tmp_path):

@@ -63,7 +63,8 @@ class LibraryResult:
 
     def to_json(self) -> dict[str, Any]:
         skills = [
-            {"name": one.name, "phrase": str(one.phrase), "tries": one.tries, "works": one.works, "steps": one.steps}
+            {"name": one.name, "phrase": str(one.phrase), "works": one.works, "steps": one.steps, "recorded": one.tries}
+            | {"tries": one.own_tries}
             for one in self.library.skills
         ]
         return jsonable({"skills": skills, **self.facts})
@@ -72,7 +73,8 @@ class LibraryResult:
         rows = []
         for one in self.library.skills:
             steps = f"{one.steps:.0f} ({one.least_steps} to {one.most_steps})"
-            rows.append([one.name, f"{one.works:.0%} of {one.tries}", steps, str(one.phrase)])
+            count = f"{one.own_tries} tries" if one.own_tries else f"{one.tries} recorded"
+            rows.append([one.name, f"{one.works:.0%} of {count}", steps, str(one.phrase)])
         lines = table_lines(["skill", "works", "steps", "instructions"], rows)
         if "ends_recognised" in self.facts:
             lines.append(

@@ -35,16 +35,20 @@ class Skill:
 
     name: str
     phrase: Phrase
-    tries: int  # segments of recordings and attempts
+    tries: int  # segments of recordings
     successes: int  # of these
     steps: float  # median of the successful ones
     least_steps: int  # 99% of the successful ones take as many
     most_steps: int  # 95% of the successful ones take no more
+    own_tries: int = 0  # of the policy itself, by `skills try`
+    own_successes: int = 0
 
     @property
     def works(self) -> float:
-        """The probability that it works where it can begin: the mean of a beta distribution."""
-        return (self.successes + 1) / (self.tries + 2)
+        """The probability that it works where it can begin: the mean of a beta distribution. Recordings, which are of a teacher,
+        count as two tries beside those of the policy itself."""
+        recorded = (self.successes + 1) / (self.tries + 2)
+        return (self.own_successes + 2 * recorded) / (self.own_tries + 2)
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,8 @@ class SkillLibrary:
     def tried(self, name: str, tries: int, successes: int) -> SkillLibrary:
         """The library with further attempts of a skill."""
         skill = self.named(name)
-        return self._with(replace(skill, tries=skill.tries + tries, successes=skill.successes + successes), name)
+        own = {"own_tries": skill.own_tries + tries, "own_successes": skill.own_successes + successes}
+        return self._with(replace(skill, **own), name)
 
     def _with(self, skill: Skill, name: str) -> SkillLibrary:
         return replace(self, skills=tuple(skill if one.name == name else one for one in self.skills))

@@ -17,11 +17,12 @@ from ..trainer import Loss
 
 @dataclass(frozen=True)
 class SkillMoments:
-    """N segments of T moments, and for each a moment on the way and the end of any segment."""
+    """N segments of T moments, and for each a moment and the end of any segment."""
 
     features: torch.Tensor  # [N, T, width], what the policy sees at them
     began: torch.Tensor  # [N, width], the same where the segments began
-    other: Mapping[str, torch.Tensor]  # channel -> [N, ...], on the way
+    here: torch.Tensor  # [N, width], the same at a moment at which the instruction can be followed
+    other: Mapping[str, torch.Tensor]  # channel -> [N, ...], at such a moment of any segment
     other_ends: Mapping[str, torch.Tensor]  # channel -> [N, ...]
     others: torch.Tensor  # bool [N]: the other segment is of another instruction
     words: torch.Tensor  # int64 [N, WORDS], the instructions of the segments
@@ -42,8 +43,7 @@ class SkillPrediction:
         with torch.no_grad():
             assert self.network.words is not None
             moments, spoken = recalled_moments(self.network, batch), self.network.words(batch.words)
-            on_way = (now.rand(count) * (inside.sum(1) - 1)).long()
-            begun = [batch.features[torch.arange(count), on_way]]
+            begun = [batch.here]
             begun += [self.network.features(each, spoken) for each in (batch.other, batch.other_ends)]
             here, other, other_ends = (
                 (

@@ -59,6 +59,17 @@ class Segments:
     success: np.ndarray  # bool [S]
     held_out: np.ndarray  # bool [S]
 
+    @property
+    def follow(self) -> bool:
+        """Whether some instruction follows another within an episode."""
+        return bool(np.isin(self.first, self.end).any())
+
+    def beginnings(self, segments: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Rows [N] at which these could be begun: their first where instructions follow one another, which shows them after others.
+        Else any before their end, for what others leave behind is seen on the way alone."""
+        length = (self.end - self.first)[segments] * (not self.follow)
+        return self.first[segments] + (rng.random(len(segments)) * length).astype(np.int64)
+
     @staticmethod
     def of(recording: Recording) -> Segments:
         """All segments of two rows or more."""
@@ -114,7 +125,7 @@ class SkillRows:
     picked: np.ndarray  # the segments to draw from
 
     def sample(self, count: int, rng: np.random.Generator) -> SkillMoments:
-        """`count` segments, and a moment on the way of as many others."""
+        """`count` segments, and a moment of as many others."""
         return self.at(rng.choice(self.picked, count), rng)
 
     def at(self, mine: np.ndarray, rng: np.random.Generator) -> SkillMoments:
@@ -124,11 +135,11 @@ class SkillRows:
         moments, device = np.arange(int((s.end[mine] - first).max()) + 1), self.rows.device
         left = (s.end[mine] - first)[:, None] - moments
         shown = np.minimum(first[:, None] + moments, s.end[mine][:, None])
-        at = s.first[other] + (rng.random(len(mine)) * (s.end - s.first)[other]).astype(np.int64)
         return SkillMoments(
             self.features.at(mine[:, None], shown).to(device),
             self.features.at(mine, s.first[mine]).to(device),
-            self.rows.observations(at),
+            self.features.at(mine, s.beginnings(mine, rng)).to(device),
+            self.rows.observations(s.beginnings(other, rng)),
             self.rows.observations(s.end[other]),
             torch.from_numpy(s.task[mine] != s.task[other]).to(device),
             self.texts[torch.from_numpy(s.task[mine])].to(device),
