@@ -74,12 +74,12 @@ class PlacePage:
         edits: Sequence[Edit],
         save: str = "",
         watch: str = "",
-        more: Mapping[str, str] | None = None,
+        more: Mapping[str, Any] | None = None,
     ) -> bytes:
         """The page with these edits, as HTML in UTF-8. save: the address to which it posts edits, else it offers a file; watch:
         the address of newer states of a place that is being fitted, without editing; more: other addresses of a server: `things`,
-        which builds what words name, `files`, which writes files, and `collider`, what stops walkers after edits; `key` goes with
-        all that the page posts."""
+        which builds what words name, `files`, which writes files, `relight`, which bakes another `light`, and `collider`, what
+        stops walkers after edits; `key` goes with all that the page posts."""
         place, merged = self._place, list({_merge_key(edit): self._opened(edit) for edit in merges_of(edits)}.values())
         about = {
             **self._packed, "name": place.name, "body": asdict(place.body), "save": save, "watch": watch,
@@ -253,13 +253,17 @@ class EditablePlace:
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
     put: Callable[[str, Spot], PutThings] | None = None  # builds what words name; may raise a TerrellaError
     export: Callable[[Mapping[str, Any], Gone], bytes] | None = None  # writes a file; may raise a TerrellaError
+    light: Callable[[], Mapping[str, Any] | None] | None = (
+        None  # of a built place: time, sun, and the times that there are
+    )
+    relight: Callable[[Mapping[str, Any]], PlaceScene] | None = None  # bakes another light; may raise a TerrellaError
     key: str = ""  # tells its page's requests from those of a page whose place the server showed before
 
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; and /collider,
-    what stops walkers after edits."""
+    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; /light, which bakes
+    another light; and /collider, what stops walkers after edits."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
     writing = threading.Lock()  # one file at a time, while edits go on
 
@@ -283,6 +287,13 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         with lock:
             return page.add(place.put(str(wish["words"]), read_spot(wish["spot"])))
 
+    def relight(content: bytes, _: Gone) -> None:
+        nonlocal page
+        wish = _wished(place, content)
+        assert place.relight is not None
+        with lock:
+            page = PlacePage(place.relight(wish), place.beside, place.merge)
+
     def close(content: bytes, _: Gone) -> bytes:
         edits, after = _edits_of(page, _wished(place, content)["lines"]), scene.collider_after
         assert after is not None
@@ -293,13 +304,15 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         ("edits", save, LONGEST_EDITS, "edits are lines of JSON"),
         ("things", build_things if place.put else None, LONGEST_WISH, "a thing has words and a spot"),
         ("files", write_file if place.export else None, LONGEST_WISH, "a file has a kind"),
+        ("relight", relight if place.relight else None, LONGEST_WISH, "a light has a time of day"),
         ("collider", close if scene.collider_after else None, LONGEST_EDITS, "edits are lines of JSON"),
     ]
     routes = [
         Route(f"/{name}", _posting(work, most, form), methods=["POST"]) for name, work, most, form in offered if work
     ]
     more = {"key": place.key} | {name: f"/{name}" for name, work, *_ in offered[1:] if work}
-    html = lambda: page.html(place.edits(), "/edits", more=more)  # noqa: E731
+    light = place.light or (lambda: None)
+    html = lambda: page.html(place.edits(), "/edits", more={**more, "light": light()})  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
 
 

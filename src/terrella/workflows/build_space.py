@@ -160,7 +160,10 @@ def _built(parsed: ParsedText, out: Path, config: BuildSpaceConfig, progress: Pr
     check_free(out)
     place = build(parsed.layout, config.gaussians, progress)
     progress("saving the place")
-    _save_built(place, parsed, out, config)
+    card: dict[str, Any] = {"objects": list(place.names), "gaussians_asked": config.gaussians}
+    if parsed.text:
+        card |= {"text": parsed.text, "not_understood": list(parsed.unknown), "no_place_for": list(parsed.left_out)}
+    save_built(place, parsed, out, config.size, card)
     return _built_result(place, parsed, out)
 
 
@@ -169,7 +172,7 @@ def _layout_or_words(source: str | Path | None) -> tuple[Path | None, str | None
     if source is None:
         return None, None
     file = Path(source)
-    words = isinstance(source, str) and not file.exists() and file.suffix.lower() not in (".json", *GLTF_ENDINGS)
+    words = isinstance(source, str) and not file.is_file() and file.suffix.lower() not in (".json", *GLTF_ENDINGS)
     return (None, str(source)) if words else (file, None)
 
 
@@ -200,18 +203,24 @@ def amount(many: int, what: str) -> str:
     return f"{many:,} {what if many == 1 else plural}"
 
 
-def _save_built(place: BuiltPlace, parsed: ParsedText, out: Path, config: BuildSpaceConfig) -> None:
+def save_built(
+    place: BuiltPlace,
+    parsed: ParsedText,
+    out: Path,
+    size: tuple[int, int],
+    card: dict[str, Any],
+    keep_edits: bool = False,
+) -> None:
+    """Saves a built place and its layout in the folder `out`. size: height and width of its pictures; card: what world.json says
+    of it; keep_edits: it replaces the place there, whose edits stay."""
     starts = place.starts.clone()
     starts[:, 2] += WALKER.eye_m
-    card: dict[str, Any] = {"objects": list(place.names)}
-    if parsed.text:
-        card |= {"text": parsed.text, "not_understood": list(parsed.unknown), "no_place_for": list(parsed.left_out)}
     origin = torch.where(place.objects < 0, INVENTED, OBSERVED).to(torch.uint8)
     world = SplatWorld(
-        parsed.layout.name, place.gaussians, origin, starts, _splat_config(config.size, WALKER), card, place.objects,
+        parsed.layout.name, place.gaussians, origin, starts, _splat_config(size, WALKER), card, place.objects,
         SolidBoxes(place.solids, place.bodies),
     )  # fmt: skip
-    save_splat(world, out)
+    save_splat(world, out, keep_edits)
     replace_whole(out / LAYOUT_FILE, lambda file: file.write_text(json.dumps(parsed.document, indent=1) + "\n"))
 
 

@@ -1,15 +1,19 @@
 """Opens a place of Gaussians for its page: what is edited there is saved in the place."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import ContractError
 from ..library import folder_of
 from ..serve.place_page import EditablePlace
+from ..serve.place_scene import PlaceScene
 from ..space.edits import Edit
 from ..worlds.splat_folder import checked_edits, merge_edit, read_edits, write_edits
 from .export_space import exported_file
 from .put_things import put_things
+from .relight_space import light_of, relight_space
 from .splat_places import compared_scene, unedited_scene
 
 
@@ -27,8 +31,16 @@ def editable_place(world: str, beside: str | None = None) -> EditablePlace:
         None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
         lambda words, spot: put_things(folder, words, spot),
         lambda wish, gone: exported_file(world, wish, gone),
+        lambda: light_of(world),
+        None if light_of(world) is None else lambda light: _relit(world, light),
         hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
     )
+
+
+def _relit(world: str, light: Mapping[str, Any]) -> PlaceScene:
+    """The place as it looks by another light, which is saved."""
+    relight_space(world, light)
+    return unedited_scene(world)
 
 
 def _merge_of(folder: Path, other: str) -> Edit | None:

@@ -34,10 +34,12 @@ MOST_ADDITIONS = 10_000_000
 EDITS_FILE, UNDONE_FILE = "world.edits.jsonl", "world.undone.jsonl"  # edits in force; edits taken back, the newest last
 
 
-def save_splat(world: SplatWorld, path: str | Path) -> None:
-    """Makes or replaces the folder as a whole. CheckpointError where something else lies there, or a world with edits."""
+def save_splat(world: SplatWorld, path: str | Path, keep_edits: bool = False) -> None:
+    """Makes or replaces the folder as a whole. CheckpointError where something else lies there, or a world with edits, unless
+    keep_edits: then they stay, as edits of the new world."""
     path = Path(path)
-    check_free(path)
+    if not keep_edits:
+        check_free(path)
     about = {
         "kind": KIND, "version": VERSION, "name": world.name, "config": asdict(world.config), "card": dict(world.card),
     }  # fmt: skip

@@ -84,7 +84,9 @@ def write_scene(
     """Writes a .ply or .spz (of `version`); kind "compressed" makes the .ply SuperSplat's. The file is replaced whole."""
     path = Path(path)
     if path.suffix.lower() not in _USUAL:
-        raise DatasetError(f"{path}: a place is written as .ply, .spz, .glb, .png or .mp4; give a name that ends so.")
+        raise DatasetError(
+            f"{path}: a place is written as .ply, .spz, .glb, .png, .mp4 or .html; give a name that ends so."
+        )
     if not len(gaussians):
         raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
     if kind == "compressed" and path.suffix.lower() != ".ply":

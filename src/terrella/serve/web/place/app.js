@@ -10,6 +10,7 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
+import { Light } from './light.js';
 import { Orbit } from './orbit.js';
 import { spotAt } from './put.js';
 import { linkBack, reach } from './reach.js';
@@ -87,7 +88,12 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   const film = new Film($('film'), {
     eye: () => walker.eye, stand: ([x, y, z, heading, pitch]) => { if (orbit.on) turnAround(); walker.set([x, y, z], heading, pitch, true); redraw(); },
     picture, unsaved: () => story.unsaved, expose: (stops) => { drawing.stops = stops; redraw(); }, redraw: () => redraw(), say: toast,
-    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', kept: `terrella-film ${[world.name, world.count, ...world.starts[0]].join()}`, address: world.files, command: world.command, key: world.key,
+    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', kept: `terrella-film ${[world.name, world.key || world.count, ...world.starts[0]].join()}`, address: world.files, command: world.command, key: world.key,
+  });
+
+  new Light($('light'), {
+    light: world.light, address: world.relight, command: world.command, key: world.key, unsaved: () => story.unsaved, say: toast,
+    leave: () => { const { place, heading, pitch } = walker.eye; sessionStorage.setItem('terrella-eye', JSON.stringify([place, heading, pitch, walker.flying])); },
   });
 
   /** The view as a picture, without lines: a blob of PNG. */
@@ -308,6 +314,8 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   if (!drawing.soft) offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
 
   seen.stands = world.count / source.length;
+  const left = world.relight && JSON.parse(sessionStorage.getItem('terrella-eye'));  // before another light was baked
+  if (left) { walker.set(...left); sessionStorage.removeItem('terrella-eye'); filming(); }
   take(story.scene);
   greet();
   linkBack();
