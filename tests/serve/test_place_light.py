@@ -80,7 +80,8 @@ def test_the_page_bakes_another_light_and_opens_it_where_one_stood(folder, opene
     page.click("[data-light=bake]")
     assert "save the edits first" in page.inner_text("#toast")
     page.evaluate("terrella.story.redo()")
-    page.click("[data-light=bake]")
+    with page.expect_navigation(timeout=120_000):
+        page.click("[data-light=bake]")
     until(page, f"!!window.terrella && terrella.idle && {colour} < 0.8 * {noon}")
     assert page.evaluate("terrella.eye.place") == pytest.approx([1, 1, 1.5], abs=0.01) and page.is_visible("#light")
     assert page.input_value("[data-light=time]") == "night" and page.evaluate("terrella.story.edits") == [EDIT]
