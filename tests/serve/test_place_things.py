@@ -63,6 +63,8 @@ def test_things_stand_in_a_row_on_walls_and_under_ceilings(tmp_path):
     assert sofa["by"] == [round(4 - 0.95 / 2, 3), 1, 0]  # its back touches the wall
     [picture] = put_things(tmp_path / "w", "a picture", Spot((4.0, 1.0, 1.6), 0.0, wall=True, degrees=270)).edits
     assert picture["by"][2] == pytest.approx(1.6 - 0.35)
+    [picture] = put_things(tmp_path / "w", "a picture", Spot((4.0, 1.0, 1.6), 2.0, wall=True, degrees=270)).edits
+    assert picture["by"][2] == pytest.approx(1.6 - 0.35)  # what is above the pointer is no floor
     [lamp] = put_things(tmp_path / "w", "a pendant", Spot((2.0, 1.0, 0.0), 0.0, ceiling=2.6)).edits
     assert lamp["by"][2] == pytest.approx(1.8)
     with pytest.raises(TerrellaError, match="400 or fewer"):

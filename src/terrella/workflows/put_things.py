@@ -77,9 +77,10 @@ def _foot(thing: Mapping[str, Any], spot: Spot, aside: float) -> Sequence[float]
     front, right = (math.sin(turn), -math.cos(turn)), (math.cos(turn), math.sin(turn))
     ahead = deep / 2 if spot.wall else 0.0
     x, y = (spot.at[k] + ahead * front[k] + aside * right[k] for k in range(2))
-    z = spot.floor
+    known = not spot.wall or spot.floor <= spot.at[2]  # what is above the pointer is no floor
+    z = spot.floor if known else spot.at[2]
     if thing["stands"] == "hung":
         z = spot.at[2] - high / 2 if spot.wall else z + thing["hangs_m"]
     elif thing["stands"] == "ceiling":
         z = (z + ROOM_HEIGHT_M if spot.ceiling is None else spot.ceiling) - high
-    return [round(v, 3) for v in (x, y, max(z, spot.floor))]
+    return [round(v, 3) for v in (x, y, max(z, spot.floor) if known else z)]
