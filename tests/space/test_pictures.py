@@ -13,7 +13,7 @@ from PIL import Image
 from terrella import load
 from terrella.cli import main
 from terrella.core.errors import DatasetError
-from terrella.learn.recipes.splat_views import SplatFit
+from terrella.learn.recipes.splat import doubts
 from terrella.space.camera import FAR_M, rotation
 from terrella.space.fitting import PosedViews
 from terrella.space.pictures import is_pictures, posed_pictures
@@ -23,7 +23,6 @@ from terrella.space.pictures.reading import blurred, read_picture, sharpness
 from terrella.space.pictures.transforms import read_transforms
 from terrella.space.raster import rasterise
 from terrella.space.stereo import with_depth
-from terrella.workflows import build_space
 from terrella.worlds.splat import SplatWorld
 
 from .test_fitting import room, views
@@ -99,6 +98,7 @@ def test_posed_pictures_become_views_and_a_world(tmp_path, capsys):
         assert main([*again, kind]) == 0
         world = load(tmp_path / "run")
         assert isinstance(world, SplatWorld) and world.config.collider == kind
+        assert world.card["doubts"] == facts["doubts"]  # the page says them
 
 
 def test_few_pictures_take_lifted_depth_and_keep_enough_out_for_an_interval(tmp_path, capsys, monkeypatch):
@@ -414,20 +414,10 @@ def test_copies_are_named_as_their_sources():
     assert [shown_name(Path(name)) for name in ("a.JPG.png", "a.png", "00005.png")] == ["a.JPG", "a.png", "00005.png"]
 
 
-def test_a_poor_fit_is_called_poor(monkeypatch):
-    facts = {
-        "gaussians": 9,
-        "pictures": 9,
-        "seconds": 1,
-        "held_out": 3,
-        "world": "w",
-        "collider": "open",
-        "left_out": [],
-    }
-    for ours, copied, poor in ((14.7, 13.6, True), (24, 23, True), (24, 15, False)):
-        both = {"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]}
-        monkeypatch.setattr(build_space, "fit_splat", lambda *_, both=both: facts | both)
-        assert any("poor" in line for line in build_space.fit_space("a", "b", SplatFit()).lines) == poor
+@pytest.mark.parametrize(("ours", "copied", "poor"), [(14.7, 13.6, True), (24, 23, True), (24, 15, False)])
+def test_a_poor_fit_is_called_poor(ours, copied, poor):
+    notes = doubts({"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]})
+    assert [f"by {ours:.1f} dB" in one for one in notes] == [True] * poor
 
 
 def test_a_recording_with_a_picture_beside_its_data_is_no_folder_of_pictures(tmp_path):

@@ -33,7 +33,6 @@ from .results import command
 from .splat_places import SpaceResult, page_scene, unheeded
 
 LAYOUT_FILE = "layout.json"
-POOR_DB, LITTLE_DB = 22.0, 3.0  # of held-out pictures, and above the nearest picture: below, a fit is called poor
 MOST_NAMES = 20  # of what is left out on one line
 WALKER = Walker(eye_m=1.65, step_m=0.35)  # in places that are built
 
@@ -83,12 +82,7 @@ def fit_space(
         f"{copied:.1f} (+-{copied_by:.1f})",
         f"walk in it: {command('terrella', 'play', facts['world'])} (collider: {facts['collider']})",
     ]
-    if ours < max(POOR_DB, copied + LITTLE_DB):
-        lines.append(
-            f"poor: held-out pictures are met by {ours:.1f} dB (good places reach {POOR_DB:.0f} or more, and {LITTLE_DB:.0f} above "
-            "the nearest picture): more --steps and --gaussians may mend it, or things moved between the pictures, or their "
-            "poses are wrong."
-        )
+    lines += facts["doubts"]
     if left_out := facts["left_out"]:
         more = f", and {len(left_out) - MOST_NAMES} more" if len(left_out) > MOST_NAMES else ""
         lines.append(f"left out (blurred, without overlap, or as named): {', '.join(left_out[:MOST_NAMES])}{more}")

@@ -31,6 +31,7 @@ LOOK_S, LOOK_SHARE, LOOKED_AT = (
     4,
 )  # seconds between previews, which take at most 1/20 of the time; their test pictures
 LATER = ("save_every_s", "collider", "inside")  # settings that a fit which goes on may change
+POOR_DB, LITTLE_DB = 22.0, 3.0  # of held-out pictures, and above the nearest picture: below, a fit is called poor
 HELD_OUT, OF_FEW = (8, 4), 16  # every 8th picture is held out to measure the fit; of fewer than 16 every 4th
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
@@ -86,13 +87,25 @@ def fit_splat(
     figures = _figures(fit, seen, tested)
     if not finished:  # else it may have been edited since
         _save(out / RESUME, fit, recipe)
-        card = {"data": str(data), "left_out": left_out, **figures}
+        card = {"data": str(data), "left_out": left_out, **figures, "doubts": doubts(figures)}
         save_splat(_world(fit.gaussians, seen, spec, named, card), out / "world")
     elif (config.collider, config.inside) != ("auto", None):
         _set_collider(out / "world", _world(fit.gaussians, seen, spec, named, {}).config)
     kind = read_about(out / "world")["config"].get("collider", "open")
     taken = {"left_out": left_out, "seconds": round(time.monotonic() - began, 1)}
-    return {**figures, **taken, "collider": kind, "world": str(out / "world")}
+    return {**figures, **taken, "doubts": doubts(figures), "collider": kind, "world": str(out / "world")}
+
+
+def doubts(figures: Mapping[str, Any]) -> list[str]:
+    """Why a fit may be poor, by its PSNR on held-out pictures: dB, of the place and of the nearest picture."""
+    ours, copied = figures["held_out_db"][0], figures["nearest_picture_db"][0]
+    if ours >= max(POOR_DB, copied + LITTLE_DB):
+        return []
+    return [
+        f"the place is poor: it meets held-out pictures by {ours:.1f} dB (good ones {POOR_DB:.0f} or more, and {LITTLE_DB:.0f} above "
+        f"the nearest picture's {copied:.1f}); more --steps and --gaussians may mend it, or things moved between the pictures, or "
+        "their poses are wrong."
+    ]
 
 
 def _set_collider(world: Path, config: SplatConfig) -> None:
