@@ -102,7 +102,7 @@ def doubts(figures: Mapping[str, Any]) -> list[str]:
     if ours >= max(POOR_DB, copied + LITTLE_DB):
         return []
     return [
-        f"the place is poor: it meets held-out pictures by {ours:.1f} dB (good ones {POOR_DB:.0f} or more, and {LITTLE_DB:.0f} above "
+        f"the place is poor: it meets held-out pictures by {ours:.1f} dB (good ones {POOR_DB:.0f} or more, {LITTLE_DB:.0f} above "
         f"the nearest picture's {copied:.1f}); more --steps and --gaussians may mend it, or things moved between the pictures, or "
         "their poses are wrong."
     ]
