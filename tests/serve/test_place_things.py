@@ -229,6 +229,9 @@ def test_who_looks_around_with_the_object_tool_selects_nothing(tmp_path, opened,
     assert not page.evaluate(chosen)
     page.mouse.click(600, 250)
     assert page.evaluate(chosen)
+    middle = """(() => { const { left, width, top, height } = document.getElementById('hint').getBoundingClientRect();
+        return document.elementFromPoint(left + width / 2, top + height / 2).id; })()"""
+    assert page.evaluate(middle) == "view"  # the hint takes no press, seen or not
     page.evaluate("terrella.editor.choose({ object: 1 }); terrella.editor.act({ do: 'delete' })")
     (tmp_path / "empty.jsonl").write_text("\n")
     page.set_input_files("#open", str(tmp_path / "empty.jsonl"))
