@@ -224,6 +224,19 @@ def test_goals_that_no_skill_reaches_are_refused_before_acting(library, words, s
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("goal", ["there.png", "grid=3"])
+def test_a_goal_that_is_not_in_words_is_named(goal, library, capsys):
+    assert main(["plan", NAME, "--skills", str(library[0]), "--goal", goal]) == 2
+    assert "skills take a goal in words" in capsys.readouterr().err
+
+
+def test_a_library_is_not_written_over_something_else(library, capsys):
+    out, recording, policy = library
+    for other, what in ((recording, "a recording"), (policy, "another policy"), (policy / "policy", "another policy")):
+        assert learned((other, recording, policy)) == 2
+        assert f"{other} holds {what}; give another --out" in capsys.readouterr().err
+
+
 def test_a_person_types_a_goal_of_several_steps_on_the_page(library):
     assert learned(library) == 0
     world = GymnasiumWorld(Errands)

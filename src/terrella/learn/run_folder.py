@@ -1,8 +1,10 @@
 """A training run on disk: the state from which it resumes exactly, replaced as a whole at every save; and its log."""
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -12,6 +14,18 @@ from ..core.errors import TrainingError
 from ..core.files import remedy_of, replacing, write_text
 
 LOG = "log.jsonl"
+
+
+def check_run(out: Path, settings: Mapping[str, Any]) -> None:
+    """TrainingError for settings with which nothing is learned, or a folder that holds a recording."""
+    for name in ("steps", "batch", "updates"):
+        if (count := settings.get(name)) is not None and count < 1:
+            raise TrainingError(f"--{name} is 1 or more; got {count}.")
+    rate = settings.get("learning_rate")
+    if rate is not None and not 0 < rate < math.inf:
+        raise TrainingError(f"--learning-rate is above 0, as in --learning-rate 0.001; got {rate:g}.")
+    if (out / "meta" / "info.json").exists():
+        raise TrainingError(f"{out} holds a recording; give another --out.")
 
 
 def resume_file(folder: Path, stage: str) -> Path:

@@ -28,7 +28,7 @@ from ..core.world import make_rng
 from .budget import Budget
 from .devices import half_is_native, yield_cores
 from .learners import Learner
-from .run_folder import load_run, resume_file, save_run, trim_log, write_log
+from .run_folder import check_run, load_run, resume_file, save_run, trim_log, write_log
 from .sized_feed import Feed, ResizableFeed
 from .train_step import TrainStep
 from .update import Update
@@ -90,6 +90,7 @@ class Run:
         if config.seed < 0:
             raise TrainingError(f"--seed is 0 or more; got {config.seed}.")
         settings = asdict(config)
+        check_run(Path(out), settings)
         times = {name: settings[name] for name in ("save_every_s", "strip_every_s") if name in settings}
         fixed = {name: value for name, value in settings.items() if name not in (*times, "device", *free)}
         budget = Budget(Path(out), settings.get("hours", math.inf))

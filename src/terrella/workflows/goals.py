@@ -12,7 +12,7 @@ from ..core.spec import Spec, kind_of
 from ..core.world import Observation, World, make_rng
 
 REWARD = "reward"
-_PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".gif")
 _WILDCARDS = ("_", "any", "nan")
 _NO_STATE = (
     "reward", "done", "uncertainty", "drifted", "invented", "truncated", "snapshot", "latent", "text", "instruction",
@@ -27,7 +27,7 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
     if equals and not Path(text).exists():
         spec.check_channels((name,))
         return {name: _value(value, name, spec)}
-    if text.lower().endswith(_PICTURES):
+    if text.lower().endswith(PICTURES):
         if "rgb" not in spec.channels:
             raise ObservationError(f"{spec.name} shows no pictures; give a state, or CHANNEL=VALUE.")
         return {"rgb": _picture(Path(text), spec, "rgb")}
@@ -57,7 +57,7 @@ def state_channel(spec: Spec) -> str:
 def _value(text: str, name: str, spec: Spec) -> torch.Tensor:
     """The value of a channel: numbers with commas (_ matches any), a .npy or .json file, or a picture file."""
     path = Path(text)
-    if text.lower().endswith(_PICTURES):
+    if text.lower().endswith(PICTURES):
         return _picture(path, spec, name)
     try:
         if path.suffix == ".npy":

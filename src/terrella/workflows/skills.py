@@ -25,7 +25,7 @@ from ..learn.recipes.imitation import open_demonstrations
 from ..learn.recipes.skills import SkillTraining, learn_skills
 from ..library import is_truth
 from ..measure.statistics import Figure, wilson
-from .goals import REWARD
+from .goals import PICTURES, REWARD
 from .opening import EnvironmentConfig, device_of, load_named
 from .plan_study import PlanConfig
 from .progress import Progress, silent, stage
@@ -205,6 +205,8 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     used = {"goal", "skills", "rollouts", "real", "episodes", "steps", "seed", *vars(config.environment), "device"}
     if useless := [key for key in changed_settings(config) if key.replace("-", "_") not in used]:
         raise TerrellaError(f"--{useless[0].replace('_', '-')}: plans of skills have no use for that.")
+    if config.goal.partition("=")[1] or config.goal.lower().endswith(PICTURES):
+        raise TerrellaError(f"--goal {config.goal}: skills take a goal in words, as in --goal 'go to the red ball'.")
     if config.episodes < 1 or (config.steps is not None and config.steps < 1):
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up.")
     assert config.skills is not None

@@ -182,10 +182,10 @@ def _shape(opened: Recording, name: str) -> tuple[int, ...] | None:
 
 
 def _check(practice: Practice, imitation: Imitation) -> None:
-    counts = (imitation.history, imitation.chunk or 1, imitation.execute or 1, practice.hidden, practice.batch or 1)
-    if min(*counts, imitation.remember + 1, imitation.waypoint + 1, practice.steps or 1) < 1 or not (
-        practice.minutes is None or practice.minutes > 0
-    ):
+    optional = (imitation.chunk, imitation.execute, practice.batch, practice.steps)
+    counts = [imitation.history, practice.hidden, *(one for one in optional if one is not None)]
+    lasts = practice.minutes is None or practice.minutes > 0
+    if min(*counts, imitation.remember + 1, imitation.waypoint + 1) < 1 or not lasts:
         raise TrainingError(
             "--history, --chunk, --execute, --hidden, --batch and --steps are 1 or more, --remember and --waypoint are 0 or more, "
             "and --minutes is above 0."

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from ...act.actor import POLICY_FILE, RUN_SUBFOLDER, read_policy
 from ...act.imitation import load_imitation_network
 from ...act.imitation_network import ImitationNetwork
 from ...act.sentences import words_of
-from ...act.skills.library import Skill, SkillLibrary
+from ...act.skills.library import KIND, Skill, SkillLibrary
 from ...act.skills.phrases import Phrase, phrases_of
 from ...act.skills.predictor import SkillPredictor
 from ...core.errors import DatasetError, TrainingError
@@ -155,6 +156,7 @@ def learn_skills(
     moment are left out. DatasetError or TrainingError where nothing can be learned."""
     if min(config.steps, config.batch) < 1:
         raise TrainingError("--steps and --batch are 1 or more.")
+    _check_folder(Path(out))
     network, _ = load_imitation_network(policy)
     if network.words is None:
         raise TrainingError(f"{policy} follows no instructions; train it on a recording with several tasks.")
@@ -180,6 +182,17 @@ def learn_skills(
     library = replace(library, card={**card, "without_effect": without}).named_as(out)
     library.write(out)
     return library, {**trainer.summary, **tested.facts(), "without_effect": without}
+
+
+def _check_folder(out: Path) -> None:
+    """TrainingError for a folder that holds something else than a library."""
+    other = (out / POLICY_FILE).is_file() and read_policy(out).get("kind") != KIND
+    for is_there, what in (
+        (other or (out / RUN_SUBFOLDER / POLICY_FILE).is_file(), "another policy"),
+        ((out / "meta" / "info.json").exists(), "a recording"),
+    ):
+        if is_there:
+            raise TrainingError(f"{out} holds {what}; give another --out.")
 
 
 def _library(
