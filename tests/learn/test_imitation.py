@@ -98,22 +98,6 @@ def fetch(tmp_path_factory):
     return world, folder / "recording", facts
 
 
-@pytest.mark.parametrize(
-    "changed, words",
-    [
-        ({"steps": 0}, "--steps are 1 or more"),
-        ({"batch": 0}, "--batch and --steps are 1 or more"),
-        ({"learning_rate": -1.0}, "--learning-rate is above 0"),
-    ],
-)
-def test_settings_with_which_nothing_is_learned_are_refused(fetch, changed, words, tmp_path):
-    recording = fetch[1]
-    with pytest.raises(TrainingError, match=words):
-        train_imitation(recording, tmp_path, replace(QUICK, **changed), Imitation(), quiet)
-    with pytest.raises(TrainingError, match="holds a recording; give another --out"):
-        train_imitation(recording, recording, QUICK, Imitation(), quiet)
-
-
 def test_an_instruction_is_followed_and_unknown_words_are_named(fetch):
     world, _, facts = fetch
     assert facts["sees"] == ["grid", "wind"] and "The policy predicts 100%" in facts["held_out_verdict"]

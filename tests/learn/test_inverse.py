@@ -84,6 +84,7 @@ def test_clips_without_actions_are_labelled_by_another_recording(recording, tmp_
     assert main([*words[: -len(QUICK) - 1], str(tmp_path / "other"), *QUICK]) == 2
     said = capsys.readouterr().err
     assert "is of gym:Other-v0, and the labels" in said and "label clips of the same environment." in said
+    assert not (tmp_path / "other").exists(), "before anything is learned"
     about.write_text(
         about.read_text().replace("Other-v0", NAME.rpartition(":")[2]).replace("Discrete(3)", "Discrete(4)")
     )
@@ -107,8 +108,15 @@ def test_policies_of_few_many_and_true_labels_are_compared(recording, tmp_path, 
     text = capsys.readouterr().out
     assert text.startswith("The model names ") and "of what the true ones gain over random actions" in text
     assert all(f"\n{arm}" in text for arm in ("labelled only", "pseudo-labelled", "all labelled", "random"))
-    assert main([*words, "--out", str(tmp_path / "x")]) == 2
-    assert "--compare plays in an environment" in capsys.readouterr().err
+    few = [*words[:5], "--out", str(tmp_path / "x")]
+    for further, sentence in (
+        (["--compare"], "--compare plays policies in an environment: name it"),
+        (["--labels", str(recording), "--labelled", "0.1"], "leave --labelled out"),
+        (["--real", NAME, "--episodes", "3"], "--episodes, --real: only --compare has a use for that"),
+    ):
+        assert main([*few, *further]) == 2
+        assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_labels_that_are_no_better_than_the_most_frequent_action_are_not_written(recording, tmp_path, capsys):

@@ -17,14 +17,15 @@ import terrella
 from terrella.act.imitation import load_imitation_network
 from terrella.act.skills.actor import SkillActor
 from terrella.act.skills.library import SkillLibrary
+from terrella.act.skills.phrases import Phrase
 from terrella.act.skills.search import SkillSearch
 from terrella.cli import main
-from terrella.core.errors import PlanningError
+from terrella.core.errors import PlanningError, TrainingError
 from terrella.core.world import make_rng
 from terrella.data import record
 from terrella.learn.demonstrations import DemonstrationRows
 from terrella.learn.recipes.imitation import Imitation, open_demonstrations, train_imitation
-from terrella.learn.recipes.skills import Segments, SkillRows, lasting
+from terrella.learn.recipes.skills import Segments, SkillRows, _skill, lasting
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
 
@@ -147,6 +148,14 @@ def test_skills_are_learned_from_long_recordings_and_planned_with(library, capsy
     assert rows["library"]["dream"]["value"] > 0.8
 
 
+@pytest.mark.parametrize("steps, least", [([20, 24, 26, 28, 30], 23), ([2, 9, 20, 30, 40], 2)])
+def test_an_instruction_that_lasts_as_long_each_time_is_not_over_sooner(steps, least):
+    count, lengths = len(steps), np.array(steps)
+    zero, won = np.zeros(count, np.int64), np.ones(count, bool)
+    skill = _skill(Phrase((("go",),)), "go", np.array([0]), Segments(zero, lengths, zero, won, ~won))
+    assert (skill.least_steps, skill.steps) == (least, np.median(steps))
+
+
 def test_what_looks_done_for_a_moment_is_told_from_what_stays_so():
     none = -torch.inf
     looks = torch.tensor([[0.0, 5, 1, 4, 4, none], [2, 2, 2, none, none, none]])
@@ -235,6 +244,22 @@ def test_a_library_is_not_written_over_something_else(library, capsys):
     for other, what in ((recording, "a recording"), (policy, "another policy"), (policy / "policy", "another policy")):
         assert learned((other, recording, policy)) == 2
         assert f"{other} holds {what}; give another --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changed, words",
+    [
+        ({"steps": 0}, "--steps are 1 or more"),
+        ({"batch": 0}, "--batch and --steps are 1 or more"),
+        ({"learning_rate": -1.0}, "--learning-rate is above 0"),
+    ],
+)
+def test_settings_with_which_nothing_is_learned_are_refused(library, changed, words, tmp_path):
+    recording = library[1]
+    with pytest.raises(TrainingError, match=words):
+        train_imitation(recording, tmp_path, replace(QUICK, **changed), Imitation(), quiet)
+    with pytest.raises(TrainingError, match="holds a recording; give another --out"):
+        train_imitation(recording, recording, QUICK, Imitation(), quiet)
 
 
 def test_a_person_types_a_goal_of_several_steps_on_the_page(library):

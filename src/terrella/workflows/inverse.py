@@ -30,7 +30,7 @@ from ..measure.statistics import Figure, mean_interval
 from .opening import Device, EnvironmentConfig
 from .progress import Progress, Report, silent, stage
 from .real_environment import STEPS
-from .results import jsonable, table_lines
+from .results import changed_settings, jsonable, table_lines
 
 LEAST = 4  # labelled episodes
 ARMS = ("labelled only", "pseudo-labelled", "all labelled")
@@ -110,12 +110,7 @@ def train_inverse(data: str | Path, config: InverseConfig, *, progress: Progress
 
     The same call continues where an earlier one was stopped. TerrellaError where clips and labels do not fit together.
     """
-    if not 0 < config.labelled < 1 or min(config.episodes, config.policy_steps) < 1:
-        raise TerrellaError("--labelled is between 0 and 1; --episodes and --policy-steps are 1 or more.")
-    if config.compare and (config.real is None or config.labels is not None):
-        raise TerrellaError(
-            "--compare plays in an environment, --real ENV, and hides actions of the recording: leave --labels out."
-        )
+    _check(config)
     real = config.environment.open(config.real) if config.compare and config.real else None
     training, source = config.training, config.labels or data
     with stage("learning actions", progress) as report:
@@ -123,8 +118,8 @@ def train_inverse(data: str | Path, config: InverseConfig, *, progress: Progress
         if real is not None:
             config_of(opened, sees, training.hidden, Imitation(training.picture_size)).check(real.spec)
         labelled = _labelled(opened, config)
-        inverse = recipe.train_inverse(opened, sees, labelled, config.out, training, report, config.device)
         clips = opened if config.labels is None else _clips(data, opened, sees, config, report)
+        inverse = recipe.train_inverse(opened, sees, labelled, config.out, training, report, config.device)
         facts, actions, sure = _label(
             inverse, clips, opened, labelled if config.labels is None else np.zeros(0, np.int64)
         )
@@ -143,6 +138,19 @@ def train_inverse(data: str | Path, config: InverseConfig, *, progress: Progress
     pictures = "png" if about.get("dtype") == "image" else "video"  # exact ones stay exact
     notes = write_source(made, out, "lerobot", LeRobotRows(pictures=pictures))
     return InverseResult({**facts, "recording": str(out), "notes": notes}, {})
+
+
+def _check(config: InverseConfig) -> None:
+    """TerrellaError for settings that exclude each other, or that nothing uses."""
+    if not 0 < config.labelled < 1 or min(config.episodes, config.policy_steps) < 1:
+        raise TerrellaError("--labelled is between 0 and 1; --episodes and --policy-steps are 1 or more.")
+    given = {f"--{name.replace('_', '-')}" for name in changed_settings(replace(config, training=InverseTraining()))}
+    if config.labels is not None and (useless := sorted(given & {"--labelled", "--compare"})):
+        raise TerrellaError(f"--labels names the recording with actions; leave {', '.join(useless)} out.")
+    if config.compare and config.real is None:
+        raise TerrellaError("--compare plays policies in an environment: name it, as in --real gym:CartPole-v1.")
+    if not config.compare and (useless := sorted(given & {"--real", "--policy-steps", "--episodes"})):
+        raise TerrellaError(f"{', '.join(useless)}: only --compare has a use for that.")
 
 
 def _labelled(opened: Recording, config: InverseConfig) -> np.ndarray:

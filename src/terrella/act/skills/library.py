@@ -38,7 +38,7 @@ class Skill:
     tries: int  # segments of recordings
     successes: int  # of these
     steps: float  # median of the successful ones
-    least_steps: int  # 99% of the successful ones take as many
+    least_steps: int  # after fewer it is not over, whatever it looks like
     most_steps: int  # 95% of the successful ones take no more
     own_tries: int = 0  # of the policy itself, by `skills try`
     own_successes: int = 0

@@ -32,6 +32,7 @@ MOST_HOLD, HOLD_COST = (
     6,
     0.01,
 )  # moments in a row that look done, at most; what one more must gain in segments that end rightly
+ALIKE = 0.5  # of the median: where four in five last longer, an end that comes sooner than they do is a false one
 AT_ONCE = 256  # moments of which features are computed
 MOST_ENDS = 256  # ends that a library keeps of a skill
 MOST_MOMENTS = 64  # of a segment: the last ones
@@ -282,7 +283,8 @@ def _skill(phrase: Phrase, name: str, tasks: np.ndarray, segments: Segments) -> 
     mine = np.isin(segments.task, tasks)
     steps = (segments.end - segments.first)[mine & segments.success]
     won = int((mine & segments.success).sum())
-    least, median, most = np.quantile(steps, (0.01, 0.5, 0.95))
+    shortest, short, median, most = np.quantile(steps, (0.01, 0.2, 0.5, 0.95))
+    least = short if short > ALIKE * median else shortest
     return Skill(name, phrase, int(mine.sum()), won, float(median), int(least), int(most))
 
 
