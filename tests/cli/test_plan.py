@@ -7,13 +7,18 @@ import shlex
 from copy import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
+from gymnasium import spaces
 from tests.cli.tiny import NAME
 
 import terrella
 from terrella.act.planning import Planner, episodes
+from terrella.act.planning.costs import checked_goal
 from terrella.cli import main
-from terrella.core.errors import TerrellaError
+from terrella.core import Spec
+from terrella.core.errors import ObservationError, TerrellaError
 from terrella.sim.randomised import Randomised
 from terrella.workflows.opening import EnvironmentConfig
 from terrella.workflows.plan_energy import DECISIONS
@@ -208,6 +213,13 @@ def test_the_real_environment_is_never_randomised(tmp_path):
     assert not isinstance(opened, Randomised)
     with pytest.raises(TerrellaError, match="was learned and is as it is"):
         refuse_randomised("doom-maze", environment)
+
+
+def test_a_goal_beyond_the_range_of_one_number_names_that_range():
+    numbers = spaces.Box(np.array([-np.inf, -2], np.float32), np.array([np.inf, 3], np.float32))
+    spec = Spec("two", spaces.Discrete(2), {"state": numbers}, (), 0.1)
+    with pytest.raises(ObservationError, match=r"holds 9, outside the range of two there \(-2 to 3\)"):
+        checked_goal(spec, {"state": torch.tensor([50.0, 9.0])})
 
 
 def test_a_plan_that_is_stopped_shows_how_far_it_came_beside_as_many_random_steps(capsys, tmp_path, monkeypatch):

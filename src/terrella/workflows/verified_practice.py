@@ -86,9 +86,9 @@ def practise_by_rule(
     )  # fmt: skip
     study = open_evaluation(inside, evaluated, progress, lambda spec: _rule(config, spec))
     dream, steps = study.pair.dream, study.pair.steps
-    _check_study(study, config, progress)
     load_practised(policy, dream, config.practice.noise)  # refuses what does not fit
     study.load(str(policy))
+    _check_study(study, config, progress)
     criterion = study.pair.criterion if config.reward == "verified" else SuccessCriterion()
     rule, arms = RewardRule(criterion, steps, config.reference), {BEFORE: str(policy)}
     practice = config.practice

@@ -118,10 +118,13 @@ def checked_goal(spec: Spec, goal: Mapping[str, torch.Tensor]) -> dict[str, torc
             low, high = (torch.from_numpy(limit.astype(np.float64)) for limit in (space.low, space.high))
             beyond = (tensor < low) | (tensor > high)
             if beyond.any():
-                value = float(tensor.double()[beyond].flatten()[0])
+                which = tuple(beyond.nonzero()[0].tolist())
+                value, lowest, highest = (
+                    float(each[at]) for each, at in ((tensor, which), (low, which[1:]), (high, which[1:]))
+                )
                 raise ObservationError(
-                    f"the goal for '{name}' holds {value:g}, outside the range of {spec.name} "
-                    f"({float(low.min()):g} to {float(high.max()):g}): it can never be reached."
+                    f"the goal for '{name}' holds {value:g}, outside the range of {spec.name} there "
+                    f"({lowest:g} to {highest:g}): it can never be reached."
                 )
         goals[name] = tensor
     return goals
