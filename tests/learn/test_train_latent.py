@@ -88,6 +88,13 @@ def run(vectors, tmp_path_factory):
     return out, facts
 
 
+def test_episodes_too_short_to_validate_are_refused_before_training(tmp_path):
+    drifting(tmp_path / "data", episodes=12, length=7)
+    with pytest.raises(DatasetError, match="too few stretches of .* rows for validation; record longer"):
+        train_latent(tmp_path / "data", tmp_path / "run", QUICK, quiet)
+    assert not (tmp_path / "run" / "world").exists()
+
+
 @pytest.mark.slow
 def test_a_leap_foretells_what_five_steps_do(vectors, tmp_path):
     train_latent(vectors, tmp_path, replace(QUICK, rollout=5), quiet)

@@ -82,15 +82,22 @@ def _prior(world: LatentWorld, recording: Recording, rows: np.ndarray) -> State 
 
 
 @torch.inference_mode()
-def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int], clips: int = CLIPS) -> OpenLoop:
-    """Rollouts over held-out episodes, after as many rows of context as the world's history has."""
-    context, data = world.network.config.history - 1, held_out_rows(recording)
+def fitting_horizons(recording: Recording, context: int, horizons: Sequence[int] = HORIZONS) -> list[int]:
+    """The horizons for which held-out episodes are long enough, after `context` rows. DatasetError where there are none."""
+    data = held_out_rows(recording)
     fitting = [step for step in sorted(horizons) if len(data.rows_within(context, step, acted=True)) >= 8]
     if not fitting:
         raise DatasetError(
-            f"the episodes of {recording.name} that training did not see have no {context + 1 + min(horizons)} rows in a "
-            "row for validation; record longer episodes."
+            f"the episodes of {recording.name} that training does not see have too few stretches of {context + 1 + min(horizons)} "
+            "rows for validation; record longer episodes, or more."
         )
+    return fitting
+
+
+def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int], clips: int = CLIPS) -> OpenLoop:
+    """Rollouts over held-out episodes, after as many rows of context as the world's history has."""
+    context, data = world.network.config.history - 1, held_out_rows(recording)
+    fitting = fitting_horizons(recording, context, horizons)
     rows = data.rows_within(context, fitting[-1], acted=True)
     rng = np.random.default_rng(0)
     rows = np.sort(rng.choice(rows, min(len(rows), clips), replace=False))

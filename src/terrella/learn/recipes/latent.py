@@ -21,7 +21,7 @@ from ...worlds.latent_network import LatentConfig, LatentNetwork
 from ...worlds.learned import About
 from ..devices import device_named
 from ..feeds import ClipStream
-from ..latent_validation import ARMS, calibrate, encode_rows, rollout_frames, validate
+from ..latent_validation import ARMS, calibrate, encode_rows, fitting_horizons, rollout_frames, validate
 from ..objectives.latent_prediction import LatentPrediction, latent_clips, parameters, set_scale
 from ..objectives.lawful import LawLoss
 from ..objectives.outcome import levels
@@ -293,6 +293,7 @@ class _Training:
             return laws(numbers[: min(max(1, sized.size // 2), clips_in(recording))] if kept else numbers)
 
         objective = LatentPrediction(self.network, self.controls, config.learning_rate, steps, laws and broken)
+        fitting_horizons(self.recording, self.network.config.history - 1)  # refuses before it trains
         trainer = Trainer(self.run, STAGE, sized, objective, total)
         done = (self.run.out / "world" / WORLD_FILE).exists() and "validation" in trainer.facts
         if not trainer.finished:
