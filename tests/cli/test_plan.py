@@ -154,19 +154,20 @@ def test_the_printed_command_evaluates_the_same_search_towards_the_same_goal(cap
 
 
 @pytest.mark.parametrize(
-    "watts, samples, iterations, said",
+    "watts, whole, samples, iterations, said",
     [
-        (2000, 32, 4, ""),
-        (640, 16, 4, "searches 16 of 32 plans a round"),
-        (40, 2, 2, "searches 2 of 32 plans a round and 2 of 4 rounds"),
-        (5, 2, 1, "cannot be kept: it takes 20 W"),
+        (2000, 32, 32, 4, ""),
+        (640, 32, 16, 4, "searches 16 of 32 plans a round"),
+        (40, 32, 2, 2, "searches 2 of 32 plans a round and 2 of 4 rounds"),
+        (5, 32, 2, 1, "cannot be kept: it takes 20 W"),
+        (40, 3, 3, 1, "searches 1 of 4 rounds"),
     ],
 )
-def test_a_budget_of_watts_takes_plans_and_then_rounds(watts, samples, iterations, said, monkeypatch, tmp_path):
+def test_a_budget_of_watts_takes_plans_and_then_rounds(watts, whole, samples, iterations, said, monkeypatch, tmp_path):
     """A joule for each plan of a round; at one decision each 0.1 s 32 plans in 4 rounds are 1,280 W."""
     joules = lambda policy, *_: (float(policy.config.samples * policy.config.iterations), None)  # noqa: E731
     monkeypatch.setattr("terrella.workflows.plan_energy._measured", joules)
-    search, lines = terrella.SearchConfig(samples=32, iterations=4, horizon=4), list[str]()
+    search, lines = terrella.SearchConfig(samples=whole, iterations=4, horizon=4), list[str]()
     study = open_study(BLIND, PlanConfig("20", within=0.001, watts=watts, search=search, out=tmp_path), lines.append)
     assert (study.search.samples, study.search.iterations) == (samples, iterations)
     assert said in "".join(lines) and bool(said) == bool(lines)

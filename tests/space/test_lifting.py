@@ -343,6 +343,8 @@ def test_a_page_of_text_and_a_fisheye_are_named():
     row, column = torch.meshgrid(torch.arange(48) - 24, torch.arange(64) - 32, indexing="ij")
     circle = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(0)) * (row**2 + column**2 < 24**2)
     assert "fisheye" in doubts(replace(layers, rgb=circle))[0]
+    cut_out = replace(layers, rgb=circle, opaque=circle.amax(0) > 0)
+    assert not any("fisheye" in one for one in doubts(cut_out))
 
 
 def test_nothing_stands_where_a_picture_is_transparent(tmp_path, capsys):

@@ -414,7 +414,9 @@ def test_copies_are_named_as_their_sources():
     assert [shown_name(Path(name)) for name in ("a.JPG.png", "a.png", "00005.png")] == ["a.JPG", "a.png", "00005.png"]
 
 
-@pytest.mark.parametrize(("ours", "copied", "poor"), [(14.7, 13.6, True), (24, 23, True), (24, 15, False)])
+@pytest.mark.parametrize(
+    ("ours", "copied", "poor"), [(14.7, 13.6, True), (24, 23, True), (24, 15, False), (36, 33.5, False)]
+)
 def test_a_poor_fit_is_called_poor(ours, copied, poor):
     notes = doubts({"held_out_db": [ours, 1.0], "nearest_picture_db": [copied, 1.0]})
     assert [f"by {ours:.1f} dB" in one for one in notes] == [True] * poor

@@ -136,7 +136,7 @@ def trust_figures(
         level = trust_level(float(curves[:, 0].double().mean()), chance)
         note = f"mean error of {level:.3g}" + ("" if figure.value < limit else "; not reached in these rollouts")
         if steps is forecast and figure.value == most:
-            note = "the measured horizon of the world's card, no longer than which it is trusted"
+            note = "the measured horizon of the world's card: it is trusted for no longer"
         figures[what] = figure, note
 
     def ratio(curves: torch.Tensor) -> torch.Tensor:

@@ -262,7 +262,7 @@ class EditablePlace:
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; /light, which bakes
+    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; /relight, which bakes
     another light; and /collider, what stops walkers after edits."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
     writing = threading.Lock()  # one file at a time, while edits go on

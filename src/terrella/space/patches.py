@@ -12,9 +12,11 @@ from .views import arrays, each_view
 
 # Steps of a cast: of how many patches, those of the largest pictures, how many pixels are tried. In doom-maze some 5,500 of
 # 156,000 coarse patches are in view; of 18,000 fine ones 2,000 fill more than 16 pixels, 50 more than 256.
-# In 16 views of both bundled worlds no pixel differs from that of twice as many patches and pixels.
-COARSE_CASTS = (8192, 4), (512, 10**9)
+# In 16 views of both bundled worlds no pixel differs from that of twice as many patches and pixels. Pictures larger than USUAL have
+# more large patches, in proportion.
+COARSE_CASTS = (16384, 4), (1024, 10**9)
 FINE_CASTS = (10**9, 64), (160, 10**9)
+USUAL = 96 * 128  # pixels
 SLANT = 6.0  # patches longer than this many times those of a wall seen head-on are no surface
 
 
@@ -133,6 +135,7 @@ def cast(
     single = [part[..., None] for part in (lift, start, shape[..., 0], area)]
     boxes = torch.cat([anchored, products.flatten(2), *single], -1)
     canvas = pose.new_full((batch, height * width + OUTSIDE), FAR_M)
+    steps = [(many * max(1, round(height * width / USUAL)), tried) for many, tried in steps]
     most = max((many for many, _ in steps if many < count), default=0)
     largest = area.topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
     for many, tried in steps:
@@ -164,7 +167,9 @@ _CORNERS = (1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (1.0, -1.0, -1.0
 def _corners_of_sides(taken: tuple[tuple[float, ...], ...]) -> torch.Tensor:
     """[9, 20], by which centre, half side across and down [9] are multiplied for what the matrix `taken` [3, 5] makes of the four
     corners."""
-    made = torch.tensor(_CORNERS).mT[:, None, :, None] * torch.tensor(taken)[:, None]  # [centre or side, axis, corner, made]
+    made = (
+        torch.tensor(_CORNERS).mT[:, None, :, None] * torch.tensor(taken)[:, None]
+    )  # [centre or side, axis, corner, made]
     return made.reshape(9, 20)
 
 

@@ -178,7 +178,7 @@ def doubts(layers: PictureLayers) -> list[str]:
             f"the picture shows little depth (its far parts are {far / near:.2f} times as far as its near ones): a wall, a "
             "logo or text?"
         )
-    if _is_round(layers.rgb):
+    if layers.opaque is None and _is_round(layers.rgb):
         notes.append("the picture is round, as a fisheye's: straight lines come out bent; rectify it before.")
     if layers.pitch < STEEP:
         notes.append(

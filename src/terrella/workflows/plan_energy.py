@@ -72,8 +72,8 @@ def priced(
     if budget is not None and not budget > 0:
         raise TerrellaError(f"--watts {budget:g} is no power to plan with; give watts above 0, as in --watts 5.")
     fewer = [*reversed(halved(search))] if budget is not None else []
-    while fewer and fewer[-1].budget_ms is None and fewer[-1].iterations > 1:
-        fewer.append(replace(fewer[-1], iterations=fewer[-1].iterations // 2))
+    while budget is not None and (least := (fewer or [search])[-1]).budget_ms is None and least.iterations > 1:
+        fewer.append(replace(least, iterations=least.iterations // 2))
     meter, period_s = EnergyMeter(cuda), search.replan * search.block * real.spec.dt_s
     observation = real.render(real.start(1, make_rng(seed)), sees)
     cost, chosen = DecisionCost(0.0, period_s, search.samples, 0, meter.how, budget), search

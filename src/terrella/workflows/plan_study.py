@@ -69,8 +69,9 @@ class PlanConfig:
     """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills. Without --goal
     each episode has the environment's own instruction."""
     watts: float | None = None
-    """Power that planning may take, in watts, at one decision each --replan moves: fewer plans are searched to keep it, and the
-    result says how many. Without an energy counter that may be read, watts are estimated from processor time."""
+    """Power that planning may take, in watts, at one decision each --replan moves: for it down to a sixteenth of the plans and
+    one round are searched, and the result says how many, or that it is not kept. Without an energy counter that may be read,
+    watts are estimated from processor time."""
     rollouts: int = 0
     """With --skills: rollouts in the world of each of the four likeliest plans, to choose among them. Default: 0, none."""
     real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
@@ -261,6 +262,8 @@ def _priced(study: PlanStudy, policy: Callable[[SearchConfig], Policy]) -> PlanS
         with stopping_with("stopped before the first decision."):
             search, cost = priced(study.search, config.watts, policy, study.real, study.sees, cuda, config.seed)
     except NoRoute:
+        if config.watts is not None:
+            study.progress("--watts is not kept: no way to the first view is known, so no decision could be measured.")
         return study
     for line in cost.lines()[1:]:
         study.progress(line)

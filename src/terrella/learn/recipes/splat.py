@@ -31,7 +31,9 @@ LOOK_S, LOOK_SHARE, LOOKED_AT = (
     4,
 )  # seconds between previews, which take at most 1/20 of the time; their test pictures
 LATER = ("save_every_s", "collider", "inside")  # settings that a fit which goes on may change
-POOR_DB, LITTLE_DB = 22.0, 3.0  # of held-out pictures, and above the nearest picture: below, a fit is called poor
+# Of held-out pictures, and above the nearest picture: below, a fit is called poor; but not from GOOD_DB on, for in a slow video the
+# nearest picture is good.
+POOR_DB, LITTLE_DB, GOOD_DB = 22.0, 3.0, 28.0
 HELD_OUT, OF_FEW = (8, 4), 16  # every 8th picture is held out to measure the fit; of fewer than 16 every 4th
 
 Watch = Callable[[Callable[[], SplatWorld], dict[str, Any]], None]
@@ -99,7 +101,7 @@ def fit_splat(
 def doubts(figures: Mapping[str, Any]) -> list[str]:
     """Why a fit may be poor, by its PSNR on held-out pictures: dB, of the place and of the nearest picture."""
     ours, copied = figures["held_out_db"][0], figures["nearest_picture_db"][0]
-    if ours >= max(POOR_DB, copied + LITTLE_DB):
+    if ours >= min(GOOD_DB, max(POOR_DB, copied + LITTLE_DB)):
         return []
     return [
         f"the place is poor: it meets held-out pictures by {ours:.1f} dB (good ones {POOR_DB:.0f} or more, {LITTLE_DB:.0f} above "

@@ -10,7 +10,7 @@ import { follow } from './follow.js';
 import { Hands } from './hands.js';
 import { offerHeadset } from './headset.js';
 import { MiniMap } from './minimap.js';
-import { Light } from './light.js';
+import { keepEye, keptEye, Light } from './light.js';
 import { Orbit } from './orbit.js';
 import { spotAt } from './put.js';
 import { linkBack, reach } from './reach.js';
@@ -93,7 +93,7 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
 
   new Light($('light'), {
     light: world.light, address: world.relight, command: world.command, key: world.key, unsaved: () => story.unsaved, say: toast,
-    leave: () => { const { place, heading, pitch } = walker.eye; sessionStorage.setItem('terrella-eye', JSON.stringify([place, heading, pitch, walker.flying])); },
+    leave: () => { const { place, heading, pitch } = walker.eye; keepEye(JSON.stringify([place, heading, pitch, walker.flying])); },
   });
 
   /** The view as a picture, without lines: a blob of PNG. */
@@ -314,8 +314,8 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   if (!drawing.soft) offerHeadset($('xr'), { drawing, walker, hands, sorter, solid: () => solid, redraw });
 
   seen.stands = world.count / source.length;
-  const left = world.relight && JSON.parse(sessionStorage.getItem('terrella-eye'));  // before another light was baked
-  if (left) { walker.set(...left); sessionStorage.removeItem('terrella-eye'); filming(); }
+  const left = world.relight && JSON.parse(keptEye());  // before another light was baked
+  if (left) { walker.set(...left); filming(); }
   take(story.scene);
   greet();
   linkBack();

@@ -2,6 +2,16 @@
 
 import { reach } from './reach.js';
 
+const EYE = 'terrella-eye';
+
+/** Keeps where one stands while the page is loaded again. */
+export function keepEye(text) { try { sessionStorage.setItem(EYE, text); } catch { /* it begins where others do */ } }
+
+/** What `keepEye` kept, once; null: nothing. */
+export function keptEye() {
+  try { const text = sessionStorage.getItem(EYE); sessionStorage.removeItem(EYE); return text; } catch { return null; }
+}
+
 export class Light {
   /** panel: its parts are named by data-light; on: light {time, sun, times}, address, command, key, unsaved(), say(text), leave(). */
   constructor(panel, on) {
@@ -33,6 +43,7 @@ export class Light {
     Object.assign(bake, { disabled: true, textContent: 'Baking …' });
     try {
       await reach(on.address + location.search, on.command, { method: 'POST', body: JSON.stringify(light) });
+      if (on.unsaved()) throw new Error('The new light is baked. Save your edits, then load the page again to see it.');
       on.leave();
       location.reload();
     } catch (error) {
