@@ -59,5 +59,5 @@ def test_environments_are_learned_one_after_the_other_and_faults_are_kept(tmp_pa
 @pytest.mark.slow
 def test_worlds_are_rehearsed(rehearsed):
     """One of each kind: test_dispatch and test_step_program hold the others."""
-    rows = rehearsed("doom-maze", "latent")
+    rows = rehearsed("islet", "latent")
     assert all(row["per_s"] > 0 and not row["error"] and row["off"] < 2e-3 for row in rows)
