@@ -153,6 +153,22 @@ def test_goals_that_cannot_be_planned_are_named_in_a_sentence(goal, said):
         planned(goal)
 
 
+def test_a_name_stands_for_a_goal_of_others(tmp_path):
+    library = library_of(SkillLibrary)
+    library.write(tmp_path)
+    library.added("Tidy up", "pick up the red key, then go to the blue box").write_names(tmp_path)
+    read = SkillLibrary.load(tmp_path)
+    groups = SkillSearch(read).instructions_of("tidy up, then go to the red box")
+    whole = SkillSearch(library).instructions_of("pick up the red key, then go to the blue box, then go to the red box")
+    assert groups == whole and len(groups) == 3
+    twice = read.added("all", "tidy up, tidy up").renamed("Tidy up", "clear")
+    assert twice.composed["all"].count("pick up") == 2 and "clear" in twice.composed
+    assert library.named_as(tmp_path).composed == read.composed
+    for name in ("Tidy up", "tidy up", " ", "go to the _ _", "go to the red key"):
+        with pytest.raises(PlanningError, match="no free name"):
+            read.added(name, "go to the red box")
+
+
 def test_a_library_is_written_renamed_and_read(tmp_path):
     library = library_of(SkillLibrary)
     library.write(tmp_path)

@@ -44,6 +44,7 @@ OPTIONS = {
     "--seed --size --skills --spread --steps --success --task --temperature --trust --watts --within",
     "skills learn": "--batch --json --learning-rate --out --policy --save-every-s --seed --steps",
     "skills list": "--json",
+    "skills add": "--json",
     "skills rename": "--json",
     "skills try": "--adapter --episodes --fps --in --json --randomise --seed --size --task",
     "score": "--clips --data --device --drift --fast --fresh --horizons --json --long-steps --new --out --quick --seed",

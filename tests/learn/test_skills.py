@@ -207,9 +207,15 @@ def test_a_skill_is_renamed_tried_and_listed(library, capsys):
     assert main(["skills", "rename", folder, "go to the _ ball", "walk"]) == 0
     assert main(["skills", "try", folder, "walk", "--in", NAME, "--episodes", "4"]) == 0
     assert "'walk' works in" in capsys.readouterr().out
+    assert main(["skills", "add", folder, "both", "go to the red ball, go to the blue ball"]) == 0
     assert main(["skills", "list", folder]) == 0
-    assert "walk" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "walk" in shown and "'both' stands for: go to the red ball, go to the blue ball" in shown
+    assert main(["plan", NAME, "--skills", folder, "--goal", "both", "--episodes", "1", "--steps", "2"]) == 0
+    assert "go to the blue ball" in capsys.readouterr().out
     for words, said in (
+        (["add", folder, "more", "go to the purple ball"], "do not know 'purple'"),
+        (["add", folder, "walk", "go to the red ball"], "no free name"),
         (["list", str(library[1])], "holds no skills; make a library"),
         (["try", folder, "walk", "--in", NAME, "--episodes", "0"], "--episodes is 1 or more"),
     ):

@@ -44,6 +44,7 @@ COMMANDS = {
     "train inverse": ("train_policy:inverse", "learn which actions clips show, from a few labelled episodes"),
     "skills learn": ("skills:learn", "learn a library of skills from a recording and a policy that imitates it"),
     "skills list": ("skills:list_", "list the skills of a library"),
+    "skills add": ("skills:add", "add a skill that is made of others"),
     "skills rename": ("skills:rename", "give a skill another name"),
     "skills try": ("skills:try_", "try a skill in an environment, and count how often it works"),
     "adapt": ("train:adapt", "adapt a world to another body or camera, on a recording of minutes"),

@@ -1,11 +1,19 @@
-"""The commands `skills learn`, `skills list`, `skills rename` and `skills try`."""
+"""The commands `skills learn`, `skills list`, `skills add`, `skills rename` and `skills try`."""
 
 from typing import Annotated
 
 from tyro.conf import Positional, arg
 
 from ..workflows.results import command
-from ..workflows.skills import LearnSkillsConfig, TrySkillConfig, learn_library, list_skills, rename_skill, try_skill
+from ..workflows.skills import (
+    LearnSkillsConfig,
+    TrySkillConfig,
+    add_skill,
+    learn_library,
+    list_skills,
+    rename_skill,
+    try_skill,
+)
 from .say import Json, RecordingName, say, show
 
 LibraryName = Annotated[str, Positional, arg(metavar="LIBRARY")]
@@ -29,6 +37,19 @@ def list_(library: LibraryName, json: Json = False) -> None:
         library: The folder of the library.
     """
     show(list_skills(library), json)
+
+
+def add(
+    library: LibraryName, name: SkillName, goal: Annotated[str, Positional, arg(metavar="GOAL")], json: Json = False
+) -> None:
+    """Add a skill that is made of others, which goals then can name.
+
+    Args:
+        library: The folder of the library.
+        name: The name of the new skill ("tidy up").
+        goal: What it stands for, in words, as for `plan --skills` ("open the drawer, put the red block in, close it").
+    """
+    show(add_skill(library, name, goal), json)
 
 
 def rename(

@@ -1,4 +1,4 @@
-"""`skills learn`, `skills list`, `skills rename`, `skills try` and `plan --skills`: a library of skills, and plans made of them."""
+"""The commands `skills ...` and `plan --skills`: a library of skills, and plans made of them."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class LibraryResult:
             | {"tries": one.own_tries}
             for one in self.library.skills
         ]
-        return jsonable({"skills": skills, **self.facts})
+        return jsonable({"skills": skills, "composed": dict(self.library.composed), **self.facts})
 
     def summary(self) -> str:
         rows = []
@@ -76,6 +76,7 @@ class LibraryResult:
             count = f"{one.own_tries} tries" if one.own_tries else f"{one.tries} recorded"
             rows.append([one.name, f"{one.works:.0%} of {count}", steps, str(one.phrase)])
         lines = table_lines(["skill", "works", "steps", "instructions"], rows)
+        lines += [f"'{name}' stands for: {goal}" for name, goal in self.library.composed.items()]
         if "ends_recognised" in self.facts:
             lines.append(
                 f"Of {self.facts['tested_segments']} segments {self.facts['ends_recognised']:.1%} are ended at their end, and "
@@ -164,6 +165,16 @@ def learn_library(data: str | Path, config: LearnSkillsConfig, *, progress: Prog
 def list_skills(library: str | Path) -> LibraryResult:
     """The skills of a library."""
     return LibraryResult(SkillLibrary.load(library), {})
+
+
+def add_skill(library: str | Path, name: str, goal: str) -> LibraryResult:
+    """A name for a goal of several instructions. PlanningError for a goal that the skills do not understand, or a name that is
+    taken."""
+    earlier = SkillLibrary.load(library)
+    SkillSearch(earlier).instructions_of(goal)
+    added = earlier.added(name, goal)
+    added.write_names(library)
+    return LibraryResult(added, {})
 
 
 def rename_skill(library: str | Path, name: str, new: str) -> LibraryResult:

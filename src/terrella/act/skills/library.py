@@ -4,8 +4,9 @@ they work."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +64,7 @@ class SkillLibrary:
     threshold: float = 0.0  # log odds of `done` from which an instruction counts as done
     hold: int = 1  # moments in a row above it
     card: Mapping[str, Any] | None = None
+    composed: Mapping[str, str] = field(default_factory=dict)  # name -> the goal, in words, that it stands for
 
     def named(self, name: str) -> Skill:
         """The skill of a name; PlanningError if there is none."""
@@ -76,17 +78,39 @@ class SkillLibrary:
 
     def renamed(self, name: str, new: str) -> SkillLibrary:
         """The library with another name for a skill; PlanningError if there is none, or the new name is taken."""
-        if new in (skill.name for skill in self.skills if skill.name != name) or not new.strip():
-            raise PlanningError(f"'{new}' is no free name for a skill; choose another.")
+        if new.lower() != name.lower():
+            self._check_free(new)
+        if name in self.composed:
+            return replace(self, composed={new if one == name else one: goal for one, goal in self.composed.items()})
         return self._with(replace(self.named(name), name=new), name)
 
+    def added(self, name: str, goal: str) -> SkillLibrary:
+        """The library with a name for a goal in words; PlanningError if the name is taken, or an instruction."""
+        self._check_free(name)
+        return replace(self, composed={**self.composed, name: self.spelled_out(goal)})
+
+    def _check_free(self, name: str) -> None:
+        taken = {one.lower() for one in (*(skill.name for skill in self.skills), *self.composed)}
+        if not name.strip() or name.lower() in taken or self.skill_of(name):
+            raise PlanningError(f"'{name}' is no free name for a skill; choose another.")
+
+    def spelled_out(self, goal: str) -> str:
+        """A goal in words, with the goals that names in it stand for."""
+        if not self.composed:
+            return goal
+        names = "|".join(re.escape(name) for name in sorted(self.composed, key=len, reverse=True))
+        meant = {name.lower(): text for name, text in self.composed.items()}
+        return re.sub(rf"(?<!\w)({names})(?!\w)", lambda found: meant[found[0].lower()], goal, flags=re.IGNORECASE)
+
     def named_as(self, folder: str | Path) -> SkillLibrary:
-        """The library with the names that a folder's library has for the same phrases; itself where there is none."""
+        """The library with the names that a folder's library has for the same phrases and for goals; itself where there is
+        none."""
         try:
-            earlier = {skill.phrase: skill.name for skill in SkillLibrary.load(folder).skills}
+            before = SkillLibrary.load(folder)
         except CheckpointError:
             return self
-        named, names = self, {skill.name for skill in self.skills}
+        earlier = {skill.phrase: skill.name for skill in before.skills}
+        named, names = replace(self, composed=before.composed), {skill.name for skill in self.skills}
         for skill in self.skills:
             name = earlier.get(skill.phrase, skill.name)
             if name not in names:
@@ -130,6 +154,7 @@ class SkillLibrary:
         folder = Path(folder)
         skills = [{**asdict(skill), "phrase": skill.phrase.places} for skill in self.skills]
         config = {"skills": skills, "end_texts": self.end_texts, "threshold": self.threshold, "hold": self.hold}
+        config["composed"] = dict(self.composed)
         ImitationActor.write(self.network, folder / FAST_FOLDER, {})
         write_policy(
             folder, {"kind": KIND, "version": VERSION, "config": config, "card": self.card or {}}, self.predictor
@@ -141,8 +166,9 @@ class SkillLibrary:
             raise CheckpointError(f"{folder} cannot be written ({error}); {remedy_of(error)}.") from error
 
     def write_names(self, folder: str | Path) -> None:
-        """Writes only what `renamed` and `tried` change."""
+        """Writes only what `renamed`, `added` and `tried` change."""
         saved = read_policy(folder)
+        saved["config"]["composed"] = dict(self.composed)
         saved["config"]["skills"] = [{**asdict(skill), "phrase": skill.phrase.places} for skill in self.skills]
         write_text(Path(folder) / POLICY_FILE, json.dumps(saved, indent=1) + "\n")
 
@@ -160,6 +186,6 @@ class SkillLibrary:
                 Skill(**{**one, "phrase": Phrase(tuple(map(tuple, one["phrase"])))}) for one in config["skills"]
             )
             texts, cut, hold = tuple(config["end_texts"]), config["threshold"], config.get("hold", 1)
-            return SkillLibrary(skills, network, predictor, ends, texts, cut, hold, card)
+            return SkillLibrary(skills, network, predictor, ends, texts, cut, hold, card, config.get("composed", {}))
         except DAMAGE as error:
             raise CheckpointError(f"{folder} is damaged or incomplete ({error}); copy or learn it again.") from error

@@ -63,6 +63,7 @@ class SkillSearch:
     def instructions_of(self, goal: str) -> Groups:
         """The instructions that the phrases of a goal may stand for; "it", and what a phrase leaves out, is a thing that an
         earlier one names. PlanningError for unknown words, or what no skill does."""
+        goal = self.library.spelled_out(goal)
         words, groups = self.library.network.words, goal_of(goal, lambda phrase: bool(self._fits(phrase)))
         assert words is not None
         unknown = [
