@@ -100,7 +100,7 @@ class SkillLibrary:
             return goal
         names = "|".join(re.escape(name) for name in sorted(self.composed, key=len, reverse=True))
         meant = {name.lower(): text for name, text in self.composed.items()}
-        return re.sub(rf"(?<!\w)({names})(?!\w)", lambda found: meant[found[0].lower()], goal, flags=re.IGNORECASE)
+        return re.sub(rf"(?<!\w)({names})(?!\w)", lambda match: meant[match[0].lower()], goal, flags=re.IGNORECASE)
 
     def named_as(self, folder: str | Path) -> SkillLibrary:
         """The library with the names that a folder's library has for the same phrases and for goals; itself where there is
