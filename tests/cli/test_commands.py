@@ -527,3 +527,11 @@ def test_a_film_passes_thousands_of_stations():
     stations = torch.rand(3000, 4)
     poses = _eased(stations, 6001)
     assert torch.allclose(poses[[0, -1], :3], stations[[0, -1], :3])
+
+
+def test_an_option_of_many_values_that_is_given_twice_is_refused(capsys):
+    """Only the last would count; of one value the last does."""
+    assert main(["practise", "p", "--in", "x", "--out", "y", "--goal", "a=1", "--goal=b=2"]) == 2
+    assert "--goal is given twice; give it once, with all of its values behind it." in capsys.readouterr().err
+    assert main(["plan", "none-such", "--seed", "1", "--seed", "2"]) == 2
+    assert "twice" not in capsys.readouterr().err

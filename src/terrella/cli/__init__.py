@@ -157,7 +157,7 @@ def _run(given: list[str]) -> int:
 
     import tyro
 
-    from .flags import dashed_path, value_of_flag
+    from .flags import dashed_path, given_twice, value_of_flag
     from .help_page import help_page
 
     module, _, function = COMMANDS[name][0].partition(":")
@@ -174,6 +174,8 @@ def _run(given: list[str]) -> int:
             parser: Any = tyro.extras.get_parser(command, prog=f"terrella {name}", config=markers)
         print(help_page(parser))
         return 0
+    if sentence := given_twice(command, words):
+        raise TerrellaError(sentence)
     try:
         return tyro.cli(command, prog=f"terrella {name}", args=words, config=markers) or 0
     except SystemExit as stop:

@@ -1,9 +1,9 @@
-"""Says what is wrong when a flag that takes no value was given one."""
+"""Says what is wrong with options: a flag that was given a value, an option that was given twice, a path taken for one."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from tyro.conf import Positional
 
@@ -31,6 +31,13 @@ def value_of_flag(command: Callable[..., Any], words: Sequence[str]) -> str:
     return ""
 
 
+def given_twice(command: Callable[..., Any], words: Sequence[str]) -> str:
+    """One sentence if an option of any number of values is there twice, of which only the last would count, else ""."""
+    options = [word.partition("=")[0].replace("_", "-") for word in words if word[:2] == "--"]
+    twice = next((one for one in _lists(command) if options.count(one) > 1), "")
+    return f"{twice} is given twice; give it once, with all of its values behind it." if twice else ""
+
+
 def dashed_path(words: Sequence[str]) -> str:
     """One sentence if a word is a path that begins with a dash, which is taken for an option, else ""."""
     return next(
@@ -50,6 +57,15 @@ def _flags(command: Any) -> Iterator[str]:
             yield from _flags(kind)
         elif kind is bool:
             yield from (f"--{name.replace('_', '-')}", f"--no-{name.replace('_', '-')}")
+
+
+def _lists(command: Any) -> Iterator[str]:
+    """The options of a command, or of a dataclass among its parameters, that take any number of values."""
+    for name, kind in get_type_hints(command).items():
+        if is_dataclass(kind):
+            yield from _lists(kind)
+        elif any(Ellipsis in get_args(one) or get_origin(one) is list for one in (kind, *get_args(kind))):
+            yield f"--{name.replace('_', '-')}"
 
 
 def _is_positional(hint: Any) -> bool:
