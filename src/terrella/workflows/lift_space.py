@@ -246,7 +246,7 @@ def _frames(picture: Path) -> list[str]:
         raise DatasetError(f"{picture} cannot be read as a picture; save it as JPEG or PNG.") from fault
     if (aspect := max(height, width) / min(height, width)) > MOST_ASPECT:
         way = "wide as it is high" if width > height else "high as it is wide"
-        raise DatasetError(f"{picture} is {aspect:.0f} times as {way}; crop it to at most {MOST_ASPECT:.0f} times.")
+        raise DatasetError(f"{picture} is {aspect:.3g} times as {way}; crop it to at most {MOST_ASPECT:.0f} times.")
     return [f"the first of its {many} frames is used."] if many > 1 else []
 
 
