@@ -174,7 +174,7 @@ def test_a_budget_of_watts_takes_plans_and_then_rounds(watts, whole, samples, it
     assert study.decision is not None and study.decision.kept == ("cannot" not in said)
 
 
-def test_the_energy_of_a_decision_is_told_beside_its_time(capsys, tmp_path):
+def test_the_energy_of_a_decision_stands_beside_its_time(capsys, tmp_path):
     found = planned(capsys, BLIND, "--goal", "20", "--no-curve", *QUICK, "--out", str(tmp_path))
     assert found["decision_joules"] > 0 and found["decision_watts"] == pytest.approx(10 * found["decision_joules"])
     assert found["futures_bytes"] > 0 and "watts" not in found

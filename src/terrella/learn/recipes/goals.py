@@ -43,8 +43,8 @@ def train_goals(
     world: World, name: str, recording: str | Path, out: str | Path, config: GoalTraining, report: Report
 ) -> dict[str, Any]:
     """Trains, or resumes, the policy in `out`/policy. Returns the facts of the run."""
-    if min(config.farthest - 1, config.hidden, config.steps, config.batch) < 1:
-        raise TrainingError("--farthest is 2 or more; --hidden, --steps and --batch are 1 or more.")
+    if min(config.farthest - 1, config.hidden) < 1:
+        raise TrainingError("--farthest is 2 or more, and --hidden 1 or more.")
     run = Run.of(out, config, report, device_of(world), practised_in=name, recording=str(recording))
     run.saved_facts(STAGE)
     torch.manual_seed(config.seed)

@@ -71,8 +71,8 @@ def train_inverse(
 ) -> InverseDynamics:  # fmt: skip
     """Trains, or resumes, a model on the episodes `labelled` of a recording; part of them calibrate its confidence. DatasetError or
     TrainingError for what cannot be learned."""
-    if min(config.before, config.after) < 0 or config.after < 1 or min(config.steps, config.batch, config.hidden) < 1:
-        raise TrainingError("--before is 0 or more; --after, --steps, --batch and --hidden are 1 or more.")
+    if config.before < 0 or min(config.after, config.hidden) < 1:
+        raise TrainingError("--before is 0 or more; --after and --hidden are 1 or more.")
     if len(labelled) < 4:
         raise DatasetError(
             f"{len(labelled)} labelled episodes are too few: 4 or more, one of which calibrates; label more."
