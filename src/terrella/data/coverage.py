@@ -47,9 +47,12 @@ class Coverage:
         if self.places < 10:
             reasons.append(f"only {self.places} different places were seen")
         if self.shown and not any(self.shown.values()):
-            reasons.append("no action has a clear effect: the pictures after all of them look alike")
+            reasons.append(
+                f"no action's effect stands out from chance in the {self.frames:,} frames looked at, of {len(self.shown)} "
+                "actions: they do little, or each was taken too seldom"
+            )
         more = "play it yourself (--human), record more --frames, and `terrella data merge` both"
-        return [f"this recording teaches little: {'; '.join(reasons)}; {more}."] if reasons else []
+        return [f"this recording may teach little: {'; '.join(reasons)}; {more}."] if reasons else []
 
 
 def measure_coverage(dataset: Dataset, most: int = 4000) -> Coverage:
