@@ -10,7 +10,8 @@ import pytest
 import torch
 from gymnasium import spaces
 
-from terrella.act.planning import SearchConfig
+from terrella.act.planning import Planner, SearchConfig, within_measured_trust
+from terrella.act.policies_by_name import NoisyPolicy, policy_of
 from terrella.core import Spec, State, make_rng
 from terrella.core.spec import chance_error, measured_trust, trust_level
 from terrella.learn.recipes.policy import Practice
@@ -18,7 +19,7 @@ from terrella.measure.clips import Clip
 from terrella.measure.exam import CLIPS, Exam, ExamConfig
 from terrella.measure.examine import examine
 from terrella.measure.trust import TRUST, forecast_trust, steps_within, trust_figures
-from terrella.workflows.trust import practice_within_trust, search_within_trust
+from terrella.workflows.trust import practice_within_trust, search_within_trust, trusted_searches
 
 CARD = {"uncertainty": {"ceiling": 0.4}}
 
@@ -92,6 +93,30 @@ def test_planners_and_practice_stop_there_and_say_so():
     assert practice_within_trust(Fading(), Practice(horizon=5), said.append).horizon == 5
     assert search_within_trust(Fading(card={}), search, said.append) == search, "a world that cannot say"
     assert len(said) == count
+
+
+def test_a_planner_by_its_name_stops_there_too():
+    card = {"uncertainty": {"ceiling": 0.4, "invents": 0.3}, "trust_steps_measured": 12}
+    said: list[str] = []
+    for name, within, moves in (
+        ("plan:horizon=40", within_measured_trust, 12),
+        ("plan:horizon=40,replan=40@0.1", within_measured_trust, 12),
+        ("plan:horizon=40,trust=0.2", within_measured_trust, 40),
+        ("plan:horizon=40,block=5", trusted_searches(said.append), 2),
+    ):
+        world = Fading(card=card)
+        policy = policy_of(name, world.spec, world, within=within)
+        planner = policy.policy if isinstance(policy, NoisyPolicy) else policy
+        assert isinstance(planner, Planner)
+        assert planner.config.horizon == moves and planner.config.replan <= moves, name
+        assert planner.config.trust == (0.2 if "trust" in name else 0.3), "the threshold of the world's card"
+    assert len(said) == 1 and "not trusted beyond 12 of 200 steps" in said[0]
+    unmeasured = Fading(card=CARD)
+    within = trusted_searches(said.append)
+    for _ in range(2):
+        policy = policy_of("plan:horizon=40", unmeasured.spec, unmeasured, within=within)
+        assert isinstance(policy, Planner) and policy.config.horizon == 20, "forecast"
+    assert len(said) == 2, "said once"
 
 
 def black(steps: int) -> Clip:

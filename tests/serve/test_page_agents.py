@@ -1,14 +1,17 @@
 """The agent that suits a world: a planner where there is something to plan for, walkers to places, sentences for what cannot be."""
 
+# pyright: reportArgumentType=false, reportOptionalCall=false
+
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from terrella.act.planning import Navigator, budget, searches
+from terrella.act.planning import Navigator, SearchConfig, budget, searches
 from terrella.core.errors import TerrellaError
 from terrella.core.world import make_rng
 from terrella.serve.protocol import Goal
@@ -48,6 +51,21 @@ def test_where_plans_bring_reward_a_planner_drives_and_gains():
     timeline = Timeline([Panorama()], 0, policy=PageAgents(Panorama(), budget_ms=5.0, name="plan").agents())
     timeline.driver.let(True)
     assert driven(timeline, 20).shown.episode_return > 10
+
+
+def test_plans_on_the_page_end_where_the_world_is_no_longer_trusted():
+    for world, goal in ((Panorama(), {}), (Mapped(), {"pose": torch.tensor([[1.0, 0.0, *[torch.nan] * 5]])})):
+        usual = searched(PageAgents(world, budget_ms=PATIENT_MS).make(goal).policy)
+        world.spec = replace(world.spec, card={**world.spec.card, "trust_steps_measured": 3})
+        cut = searched(PageAgents(world, budget_ms=PATIENT_MS).make(goal).policy)
+        assert cut.horizon * cut.block <= max(3, cut.block) < usual.horizon * usual.block
+    named = PageAgents(Panorama(), name="plan:horizon=9", budget_ms=PATIENT_MS)
+    named.played.spec = replace(named.played.spec, card={"trust_steps_measured": 3})
+    assert searched(named.make({}).policy).horizon == 3
+
+
+def searched(policy) -> SearchConfig:
+    return (policy.planner if isinstance(policy, Navigator) else policy).config
 
 
 def test_where_all_plans_bring_the_same_the_explorer_drives():

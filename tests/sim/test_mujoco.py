@@ -16,6 +16,9 @@ import torch
 
 from terrella.core import State, check_world, make_rng
 from terrella.core.errors import TerrellaError
+from terrella.core.policy import Idle
+from terrella.core.spec import neutral_action
+from terrella.data import Dataset, record
 from terrella.library import load
 
 if find_spec("mujoco") is None:
@@ -219,6 +222,14 @@ def test_an_unstable_world_ends_and_can_be_repeated(tmp_path):
     before = State.load(dump)
     with pytest.warns(RuntimeWarning, match="unstable"):
         assert world.imagine(before, before["action"], rng)["done"].tolist() == [True]
+
+
+def test_bodies_without_an_actuator_have_one_action_to_wait_and_are_recorded(tmp_path):
+    world = load("physics:stacking", pictures=False)
+    check_world(world)
+    assert world.spec.action_names == ("wait",) and neutral_action(world.spec) == 0
+    record(world, Idle(world.spec), tmp_path / "recording", 130, make_rng(0))
+    assert Dataset(tmp_path / "recording").length == 130
 
 
 def test_joints_without_names_get_servos_too(tmp_path):

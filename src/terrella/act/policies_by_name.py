@@ -6,7 +6,7 @@ import os
 import runpy
 import sys
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,7 +23,7 @@ from .driver import driver_of
 from .explorer import Explorer
 from .goal_network import KIND, GoalActor
 from .lerobot_policy import kind_of_policy
-from .planning import Cost, Planner, SearchConfig, negative_reward
+from .planning import Cost, Planner, SearchConfig, negative_reward, within_measured_trust
 from .planning.searches import Kind
 from .teacher import teacher_of
 
@@ -56,19 +56,29 @@ class NoisyPolicy:
         return torch.where(replaced.view(-1, *[1] * (action.ndim - 1)), noise, action), memory
 
 
-def policy_of(name: str, spec: Spec, world: World | None = None, cost: Cost | None = None) -> Policy:
+Within = Callable[[World, SearchConfig], SearchConfig]
+
+
+def policy_of(
+    name: str,
+    spec: Spec,
+    world: World | None = None,
+    cost: Cost | None = None,
+    within: Within = within_measured_trust,
+) -> Policy:
     """The policy of a name (POLICY_NAMES) for the actions and channels of `spec`. world: the one in which `plan` plans. cost: of
-    `plan`, by default negative reward. TerrellaError for an unknown name."""
+    `plan`, by default negative reward. within: shortens its plans to what the world is trusted for. TerrellaError for an unknown
+    name."""
     text, at, share = name.rpartition("@")
     if not at or Path(name).is_dir():
-        return _without_noise(name, spec, world, cost)
+        return _without_noise(name, spec, world, cost, within)
     try:
         probability = float(share)
     except ValueError:
         probability = -1.0
     if not 0 <= probability <= 1:
         raise TerrellaError(f"'{name}': give a probability of 0 to 1 after the @, as in {text or 'idle'}@0.3.")
-    return NoisyPolicy(_without_noise(text, spec, world, cost), probability, spec)
+    return NoisyPolicy(_without_noise(text, spec, world, cost, within), probability, spec)
 
 
 def proposal_policy(name: str, world: World) -> Policy:
@@ -78,7 +88,7 @@ def proposal_policy(name: str, world: World) -> Policy:
     return policy_of(name, world.spec, world)
 
 
-def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None) -> Policy:
+def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None, within: Within) -> Policy:
     head, colon, rest = name.partition(":")
     simple: dict[str, Callable[[Spec], Policy]] = {"random": Random, "idle": Idle, "explorer": Explorer}
     if head in simple:
@@ -90,7 +100,7 @@ def _without_noise(name: str, spec: Spec, world: World | None, cost: Cost | None
     if head in ("driver", "teacher"):
         return (driver_of if head == "driver" else teacher_of)(rest, spec)
     if head == "plan":
-        return _planner(name, rest, world, cost)
+        return _planner(name, rest, world, cost, within)
     if colon:
         return _own(name, spec)
     if Path(name).is_dir():
@@ -122,7 +132,7 @@ def _action(text: str, spec: Spec) -> torch.Tensor:
         raise TerrellaError(f"'constant:{text}': {error}") from error
 
 
-def _planner(name: str, text: str, world: World | None, cost: Cost | None) -> Planner:
+def _planner(name: str, text: str, world: World | None, cost: Cost | None, within: Within) -> Planner:
     """A planner over the world, by settings as in plan:samples=16,horizon=12."""
     if world is None:
         raise TerrellaError(f"'{name}' needs a world to plan in.")
@@ -144,7 +154,8 @@ def _planner(name: str, text: str, world: World | None, cost: Cost | None) -> Pl
     levels = world.spec.card.get("uncertainty")
     trust = levels.get("invents") if isinstance(levels, dict) and "uncertainty" in world.spec.channels else None
     cost = negative_reward(world.spec) if cost is None else cost
-    return Planner(world, cost, SearchConfig(**{"trust": trust, **given}))
+    search = within(world, SearchConfig(**given).filled())
+    return Planner(world, cost, replace(search, trust=trust if search.trust is None else search.trust))
 
 
 def _own(name: str, spec: Spec) -> Policy:

@@ -82,9 +82,9 @@ class MujocoConfig:
 class MujocoWorld:
     """`MujocoWorld("go1")`, a ready robot (sim/mujoco_robots.py), or `MujocoWorld("FILE.xml")`, an MJCF or URDF file.
 
-    Actions are the actuators' controls, in their units. Channels: observation, qpos, qvel, sensor.NAME for each sensor, contacts
-    (the sum of normal forces on each body, N), reward, done, those of the task, and rgb, pose, depth and segmentation of each
-    camera. After `done` a world stands still with reward 0. Only `start` uses `rng`.
+    Actions are the actuators' controls, in their units, or one, to wait, where there is no actuator. Channels: observation, qpos,
+    qvel, sensor.NAME for each sensor, contacts (the sum of normal forces on each body, N), reward, done, those of the task, and
+    rgb, pose, depth and segmentation of each camera. After `done` a world stands still with reward 0. Only `start` uses `rng`.
 
     State, all [B, ...]: physics float64 is MuJoCo's full physics state (time, qpos, qvel, act); warmstart [B, nv] of the solver;
     ctrl [B, nu] of the last step; sensors; done; reward; the tensors of the task.
@@ -254,6 +254,7 @@ class MujocoWorld:
         values = state["parameters"] if self.varied else torch.zeros(state.batch, 0)
         with self._lock:
             ctrl = action if self._pilot is None else self._pilot(self.layout, state, action)
+            ctrl = ctrl if self.file.nu else state["ctrl"]
             result = self._stepper.step(state["physics"], state["warmstart"], ctrl, values, self._steps)
         physics, sensors, warmstart = result
         unstable = ~(physics.isfinite().all(1) & (physics[:, self.layout.qvel].abs() < MAX_SPEED).all(1))
@@ -404,6 +405,8 @@ class MujocoWorld:
                 "action_frame": pilot.frame,
             }
             return {"action": spaces.Box(-high, high), "keys": dict(pilot.keys), "idle": (0.0,) * len(high), **named}
+        if not model.nu:
+            return {"action": spaces.Discrete(1), "action_names": ("wait",), "keys": {}}
         low, high, rest = (np.asarray(limit, np.float32) for limit in (limits.low, limits.high, limits.rest))
         return {
             "action": spaces.Box(low, high),

@@ -11,7 +11,7 @@ from .. import library
 from ..act.best_of import best_of
 from ..act.paired_evaluation import CHUNK, Chunk, PairedEvaluation, check_finite
 from ..act.planning import Cost, FullyObserved, SuccessCriterion, distance, distance_to
-from ..act.policies_by_name import policy_of
+from ..act.policies_by_name import Within, policy_of
 from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, observed_channels
 from ..core.spec import Spec
@@ -35,6 +35,7 @@ from .opening import Device, EnvironmentConfig, device_of, load_named
 from .progress import Progress, silent, stage
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 from .results import folder_name, jsonable, table_lines
+from .trust import trusted_searches
 
 BEST_OF = re.compile(r"^best:(\d+):")
 
@@ -111,12 +112,13 @@ class Evaluation:
     pair: PairedEvaluation
     spec: Spec  # Of the channels that both worlds render, which policies may see.
     cost: Cost | None
+    within: Within  # Shortens the plans of the policy `plan`.
 
     def load(self, name: str) -> Policy:
         """The policy of a name; "best:4:FOLDER" is the best of 4 plans."""
         if best := BEST_OF.match(name):
             return best_of(name[best.end() :], int(best[1]), self.pair.dream, self.pair.criterion)
-        return policy_of(name, self.spec, self.pair.dream, self.cost)
+        return policy_of(name, self.spec, self.pair.dream, self.cost, self.within)
 
 
 def _best_of(policies: Sequence[str], counts: Sequence[int]) -> list[str]:
@@ -240,7 +242,8 @@ def open_evaluation(
     both = comparable_channels(dream.spec, real.spec) if real else ()
     both = tuple(one for one in both if len(channels[one].shape or ()) == 1 or one in dream.spec.observes)
     pair = PairedEvaluation(dream, real, criterion, limit, config.seed, both, real is not None and rule is not None)
-    return Evaluation(pair, replace(dream.spec, channels=channels), distance_to(dream, goal) if goal else None)
+    cost = distance_to(dream, goal) if goal else None
+    return Evaluation(pair, replace(dream.spec, channels=channels), cost, trusted_searches(progress))
 
 
 def _criterion(config: EvaluateConfig, goal: Mapping[str, Any], dream: Spec, real: World | None) -> SuccessCriterion:

@@ -23,8 +23,9 @@ from ..act.planning import (
     imagined_futures,
     negative_reward,
     search_config_within,
+    within_measured_trust,
 )
-from ..act.policies_by_name import NoisyPolicy
+from ..act.policies_by_name import NoisyPolicy, Within, policy_of
 from ..act.sentences import words_of
 from ..act.skills.actor import SkillActor
 from ..act.skills.library import KIND as SKILLS
@@ -36,6 +37,8 @@ from ..core.state import State
 from ..core.world import Observation, World, make_rng
 from ..serve.agent import Agent, Agents, Futures
 from .goals import state_channel, with_estimated_pose
+from .progress import silent
+from .trust import trusted_searches
 
 TEXT_CHANNEL = "text"
 INSTRUCTED = (ImitationActor, SkillActor)
@@ -75,7 +78,7 @@ class PageAgents:
             if agent is None:
                 raise PlanningError(f"{self.played.spec.name} cannot be planned in for reward; set a goal.")
             return agent
-        policy = library.load_policy(self.name, self._spec, self.world)
+        policy = policy_of(self.name, self._spec, self.world, within=self._within)
         plans = policy.policy if isinstance(policy, NoisyPolicy) else policy
         if isinstance(plans, Planner):
             return Agent(self.name, policy, self.see, futures=self._futures(plans) if plans is policy else None)
@@ -146,6 +149,10 @@ class PageAgents:
         names = dict.fromkeys((*shown.observes, *shown.may_observe, *_SHOWN))
         return self.played.render(state, [name for name in names if name in spec.channels])
 
+    @cached_property
+    def _within(self) -> Within:
+        return trusted_searches(silent)
+
     # -- agents -------------------------------------------------------------------------------------------------------
 
     def _planning(self, always: bool) -> Agent | None:
@@ -158,7 +165,7 @@ class PageAgents:
         if not always and not (fits and cost_discriminates(world, cost, state)):
             return None
         moves = max(1, round(_REPLAN_S / (world.spec.dt_s * config.block)))
-        planner = Planner(world, cost, replace(config, replan=min(moves, config.horizon)))
+        planner = Planner(world, cost, self._within(world, replace(config, replan=min(moves, config.horizon))))
         return Agent("a planner for reward", planner, self.see, futures=self._futures(planner))
 
     def _futures(self, planner: Planner) -> Callable[[Any], Futures] | None:
@@ -184,7 +191,7 @@ class PageAgents:
         latent = "latent" in source.spec.channels and set(whole) == set(source.spec.observes) and whole
         cost = distance_to(source, whole) if latent else distance_to(world, aim, latent=False)
         config, _ = search_config_within(world, cost, self._first(world), self.budget_ms, block=2)
-        planner = Planner(world, cost, config)
+        planner = Planner(world, cost, self._within(world, config))
 
         def away(state: State) -> float:
             return float(distance(self.played.spec, aim, self.played.render(state, list(aim)))[0])
@@ -197,7 +204,7 @@ class PageAgents:
         cost = goal.cost(world)
         block = max(1, round(STRIDE_S / world.spec.dt_s))
         config, _ = search_config_within(world, cost, self._first(world), self.budget_ms, block)
-        planner = Planner(world, cost, config)
+        planner = Planner(world, cost, within_measured_trust(world, config))
 
         def away(state: State) -> float:
             return float(goal.distance_m(self.played.render(state, ("pose",))["pose"].cpu())[0])

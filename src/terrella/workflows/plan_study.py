@@ -22,6 +22,7 @@ from ..act.planning import (
     distance_to,
     negative_reward,
     play,
+    within_measured_trust,
 )
 from ..act.planning.episodes import PlayInterrupted
 from ..act.planning.routes import NoRoute
@@ -38,7 +39,7 @@ from .place_goals import WALK_S, PlaceGoals, is_recording, views_of, walking_def
 from .plan_energy import DecisionCost, priced
 from .progress import Progress, stage, stopping_with
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
-from .trust import search_within_trust
+from .trust import search_within_trust, trusted_searches
 
 WITHIN = 0.05  # default distance at which a goal is reached, where it is no place
 
@@ -175,7 +176,9 @@ class PlanStudy:
         if self.config.agent:
             planned = self.goal or "reward" in self.world.spec.channels
             cost = cost_of(self.world, self.goal, self.config) if planned else None
-            return self._play(policy_of(self.config.agent, self.real.spec, self.world, cost), what, self.sees, keep)
+            within = trusted_searches(self.progress)
+            policy = policy_of(self.config.agent, self.real.spec, self.world, cost, within)
+            return self._play(policy, what, self.sees, keep)
         if self.places:
             return self._play(partial(walker, self.world, search), what, self.sees, keep)
         return self._play(planner_of(self.world, self.goal, self.config, search), what, self.sees, keep)
@@ -207,7 +210,8 @@ def planner_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfi
 
 def walker(world: World, search: SearchConfig, goal: Destination) -> Policy:
     """A policy that walks to a place. Its plans are short: uncertainty, which takes drawing every frame, ends them only if `trust`
-    is set."""
+    is set, else the world's measured trust horizon."""
+    search = within_measured_trust(world, search)
     return goal.navigator(Planner(world, goal.cost(world), search))
 
 

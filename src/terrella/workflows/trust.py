@@ -1,8 +1,10 @@
-"""Planners and practice stop where a world's trust horizon ends, and say so."""
+"""Planners, and practice, stop where a world's trust horizon ends, and say so."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from ..act.planning import SearchConfig
+from ..core.spec import measured_trust
 from ..core.world import World
 from ..learn.recipes.policy import Practice, settings_in
 from ..measure.trust import forecast_trust
@@ -14,9 +16,19 @@ def search_within_trust(world: World, search: SearchConfig, progress: Progress) 
     world that expects no error. search: without zeros."""
     if search.trust is not None:
         return search
-    moves = _trusted(world, search.horizon * search.block, "plans", progress) // search.block
-    horizon = max(1, min(search.horizon, moves))
-    return replace(search, horizon=horizon, replan=min(search.replan, horizon))
+    return search.within(_trusted(world, search.horizon * search.block, "plans", progress))
+
+
+def trusted_searches(progress: Progress) -> Callable[[World, SearchConfig], SearchConfig]:
+    """`search_within_trust` of one world, which forecasts, and says so, once for each search."""
+    known: dict[SearchConfig, SearchConfig] = {}
+
+    def within(world: World, search: SearchConfig) -> SearchConfig:
+        if search not in known:
+            known[search] = search_within_trust(world, search, progress)
+        return known[search]
+
+    return within
 
 
 def practice_within_trust(world: World, practice: Practice, progress: Progress) -> Practice:
@@ -30,13 +42,15 @@ def practice_within_trust(world: World, practice: Practice, progress: Progress) 
 
 def _trusted(world: World, steps: int, what: str, progress: Progress) -> int:
     """At most `steps`: the steps for which the world can be trusted. Says where that is fewer."""
-    forecast = forecast_trust(world, steps)
-    if forecast is None or not forecast.ends:
+    forecast, most = forecast_trust(world, steps), measured_trust(world.spec)
+    trusted = min(steps, steps if most is None else most, forecast.steps if forecast else steps)
+    if trusted == steps:
         return steps
-    why = f"there it expects an error of {forecast.level:.2g}, half way to chance"
-    why = "there its error was measured to be half way to chance" if forecast.measured else why
+    why = "there its error was measured to be half way to chance"
+    if forecast and trusted != most:
+        why = f"there it expects an error of {forecast.level:.2g}, half way to chance"
     progress(
-        f"{world.spec.name} is not trusted beyond {max(1, forecast.steps)} of {steps} steps: {why}. Its {what} end there; --trust "
-        "sets another limit."
+        f"{world.spec.name} is not trusted beyond {max(1, trusted)} of {steps} steps: {why}. Its {what} end there; --trust sets "
+        "another limit."
     )
-    return forecast.steps
+    return trusted

@@ -10,7 +10,7 @@ from .imagined_futures import ImaginedFuture, imagined_futures
 from .planner import Decision, Planner, PlannerMemory
 from .problem import PlanningProblem
 from .routes import NEAR_M, STRIDE_S, Destination, Navigator
-from .searches import SearchConfig, SearchResult, WarmStart, search
+from .searches import SearchConfig, SearchResult, WarmStart, search, within_measured_trust
 
 __all__ = ["NEAR_M", "STRIDE_S", "ActionModel", "Cost", "CostModel", "Decision", "Destination", "FullyObserved"]
 __all__ += ["GoalBeliefPolicy", "ImaginedFuture", "Navigator", "Planner", "PlannerMemory", "PlanningProblem"]
@@ -24,4 +24,4 @@ __all__ += [
     "WarmStart",
 ]
 __all__ += ["cost_discriminates", "distance", "distance_to", "imagined_futures", "negative_reward", "play"]
-__all__ += ["play_from", "search", "search_config_within"]
+__all__ += ["play_from", "search", "search_config_within", "within_measured_trust"]

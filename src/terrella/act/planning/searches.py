@@ -11,7 +11,9 @@ import torch
 
 from ...core import chance
 from ...core.errors import PlanningError
+from ...core.spec import measured_trust
 from ...core.state import State
+from ...core.world import World
 from .moves import ContinuousMoves, coloured
 from .problem import PlanningProblem, check_finite_costs
 
@@ -73,9 +75,21 @@ class SearchConfig:
             replan=self.replan or replan,
         )
 
+    def within(self, steps: int) -> SearchConfig:
+        """The same, without zeros, with plans of at most `steps` environment steps; at least one move."""
+        horizon = max(1, min(self.horizon, steps // self.block))
+        return replace(self, horizon=horizon, replan=min(self.replan, horizon))
+
     @property
     def elite_count(self) -> int:
         return min(self.elites or max(2, self.samples // 8), self.samples)
+
+
+def within_measured_trust(world: World, search: SearchConfig) -> SearchConfig:
+    """The search, without zeros, with plans no longer than the measured trust horizon of the world's card; as it is where there
+    is none, or `trust` is set."""
+    steps = measured_trust(world.spec)
+    return search if steps is None or search.trust is not None else search.within(steps)
 
 
 @dataclass(frozen=True)
