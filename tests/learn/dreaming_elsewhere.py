@@ -1,4 +1,5 @@
-"""What a training looks at and learns its uncertainty from, on the pretended device of another_device.py: strips, rollouts, drift.
+"""What a training looks at and learns its uncertainty from, on the pretended device of another_device.py: strips, rollouts, drift;
+and what a latent world is validated by.
 
 Run as a program with a recording and the folder of a world with an uncertainty. `test_devices.py` does.
 """
@@ -6,6 +7,7 @@ Run as a program with a recording and the folder of a world with an uncertainty.
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +16,13 @@ from another_device import OTHER, Pretended
 from torch.overrides import TorchFunctionMode
 
 from terrella.data import ClipCache, Dataset
-from terrella.learn import strips
+from terrella.learn import latent_validation, strips
 from terrella.learn.objectives.drift import drift_frames
 from terrella.learn.objectives.uncertainty import DreamSettings, dream
+from terrella.learn.recipes.latent import LatentTraining, train_latent
 from terrella.learn.recording import Recording
 from terrella.space.floorplan import floor_plan
-from terrella.worlds.folder import load_world
+from terrella.worlds.folder import load_latent, load_world
 
 
 class Made(TorchFunctionMode):
@@ -39,6 +42,22 @@ def without_inference(function: Any) -> Any:
     return torch.no_grad()(function.__wrapped__)
 
 
+def _validate(data: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        tiny = LatentTraining(steps=2, latent=8, hidden=16, members=2, history=1, rollout=2, leap=0, device="cpu")
+        train_latent(data, folder, tiny, lambda *_: None)
+        world = load_latent(Path(folder) / "world")
+    for name in ("encode_rows", "open_loop", "rollout_frames"):
+        setattr(latent_validation, name, without_inference(getattr(latent_validation, name)))
+    with Made(), Pretended():
+        there = world.to(OTHER)
+        recording = Recording.open(Dataset(data), world.network.config.size, lambda *_: None)
+        latent_validation.calibrate(there, recording)
+        assert there.network.spread.device == OTHER
+        assert latent_validation.validate(there, recording)["verdict"]
+        assert latent_validation.rollout_frames(there, recording)
+
+
 def main() -> None:
     data, run = map(Path, sys.argv[1:])
     world = load_world(run / "world")
@@ -53,6 +72,7 @@ def main() -> None:
         assert {part.device.type for part in (*dreamt, *drifted)} == {"cpu"} and torch.isfinite(drifted.error).all()
         strips.draw_strip([there], recording, run / "there.png")
         assert floor_plan(torch.zeros(0, 2, 4).to(OTHER), torch.zeros(0, 7).to(OTHER)).device == OTHER
+    _validate(data)
     print("dreams elsewhere")
 
 

@@ -81,7 +81,6 @@ def _prior(world: LatentWorld, recording: Recording, rows: np.ndarray) -> State 
     return world.start(len(rows), make_rng(0)).replace(glances=network.glance(looks).unflatten(0, at.shape), ages=ages)
 
 
-@torch.inference_mode()
 def fitting_horizons(recording: Recording, context: int, horizons: Sequence[int] = HORIZONS) -> list[int]:
     """The horizons for which held-out episodes are long enough, after `context` rows. DatasetError where there are none."""
     data = held_out_rows(recording)
@@ -94,6 +93,7 @@ def fitting_horizons(recording: Recording, context: int, horizons: Sequence[int]
     return fitting
 
 
+@torch.inference_mode()
 def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int], clips: int = CLIPS) -> OpenLoop:
     """Rollouts over held-out episodes, after as many rows of context as the world's history has."""
     context, data = world.network.config.history - 1, held_out_rows(recording)
@@ -143,7 +143,7 @@ def validate(world: LatentWorld, recording: Recording, horizons: Sequence[int] =
         for name, _ in world.network.config.vectors
     }
     error = torch.cat([rolled.latent[ARMS[0], step] for step in rolled.steps])
-    expected = world.network.expected(torch.cat([rolled.spread[step] for step in rolled.steps]))
+    expected = world.network.expected(torch.cat([rolled.spread[step] for step in rolled.steps])).cpu()
     table = _rounded(rolled.table())
     return {
         "verdict": verdict(table["latent"], probe),

@@ -306,16 +306,17 @@ class _Training:
         return {"world": str(self.run.out / "world"), **summary, **trainer.facts["validation"]}
 
     def _finish(self, trainer: Trainer) -> None:
-        """Saves the trained world, then calibrates and validates it, and saves it again with its figures."""
+        """Saves the trained world, then calibrates and validates it where it was trained, and saves it again with its figures."""
         world = self.world(trainer)
         save_latent(world, self.run.out / "world")  # it can be used, should a kill come before it is validated
         self.run.report(1, 1, "validating on held-out episodes")
-        calibrate(world, self.recording)
-        figures = validate(world, self.recording)
-        validated = LatentWorld(_with_figures(world.about, figures), world.network, world.starts)
-        save_latent(validated, self.run.out / "world")
+        dreamer = world.to(self.run.device)
+        calibrate(dreamer, self.recording)
+        figures = validate(dreamer, self.recording)
+        self._strip(dreamer, trainer)
+        world = LatentWorld(_with_figures(world.about, figures), dreamer.network.cpu(), world.starts)
+        save_latent(world, self.run.out / "world")
         (self.run.out / "validation.json").write_text(json.dumps(figures, indent=1) + "\n")
-        self._strip(world, trainer)
         self.network.spread.copy_(world.network.spread)
         self.network.error.copy_(world.network.error)
         trainer.compute_once("validation", lambda: figures)
@@ -354,7 +355,7 @@ class _Training:
         """Saves the world as it now is, so that it can be used while it trains, and a picture of truth above a rollout."""
         world = self.world(trainer)
         save_latent(world, self.run.out / "world")
-        self._strip(world, trainer)
+        self._strip(world.to(self.run.device), trainer)
 
     @torch.inference_mode()
     def _strip(self, world: LatentWorld, trainer: Trainer) -> None:
