@@ -9,10 +9,12 @@ import torch
 
 from terrella.core.errors import TerrellaError
 from terrella.serve.place_page import build_place
+from terrella.serve.thing_page import Spot
 from terrella.workflows.build_space import BuildSpaceConfig, build_space
 from terrella.workflows.editable_place import editable_place
-from terrella.workflows.relight_space import light_of, relight_space
-from terrella.worlds.splat_folder import load_source, read_edits, save_splat, write_edits
+from terrella.workflows.put_things import put_things
+from terrella.workflows.relight_space import light_of, name_at, relight_space
+from terrella.worlds.splat_folder import UNDONE_FILE, load_source, read_edits, save_splat, write_edits
 
 from .test_place_page import opened, serving, until, world  # noqa: F401  (fixtures)
 
@@ -20,6 +22,7 @@ LAYOUT = {
     "rooms": [{"name": "hall", "at": [0, 0], "size": [3, 3, 2.5], "walls": "white plaster"}],
     "windows": [{"room": "hall", "wall": "south", "at": 1.5, "sill": 0.9}],
     "things": [{"label": "chair", "at": [1, 2]}],
+    "name": "a hall at noon",
     "time": "noon",
 }
 EDIT = {"select": {"object": 2}, "do": "move", "by": [0.5, 0, 0]}
@@ -42,6 +45,7 @@ def test_another_light_is_baked_and_objects_and_edits_stay(folder, tmp_path):
     relight_space(str(folder), {"time": "night", "sun": None})
     light = light_of(str(folder))
     assert light and (light["time"], light["sun"], light["times"]["noon"]) == ("night", None, (200.0, 50.0))
+    assert load_source(folder).name == "a hall at night" == json.loads((folder / "layout.json").read_text())["name"]
     assert brightness(folder) < noon - 0.1 and load_source(folder).object_names == names
     assert read_edits(folder) == [EDIT] and (folder / "layout.json").exists()
     relight_space(str(folder), {"time": "noon", "sun": None})
@@ -49,6 +53,32 @@ def test_another_light_is_baked_and_objects_and_edits_stay(folder, tmp_path):
     relight_space(str(folder), {"time": "noon", "sun": [150, 20]})
     light = light_of(str(folder))
     assert light and light["sun"] == (150.0, 20.0) and brightness(folder) != noon
+
+
+def test_what_was_put_is_lit_anew_too(folder):
+    (chair,) = put_things(folder, "a red chair", Spot((2, 1, 0), floor=0, degrees=90)).edits
+    write_edits(folder, [EDIT, chair], [chair])
+    whole = [load_source(folder, None).gaussians.sh[:, 0]]
+    for time in ("night", "noon"):
+        relight_space(str(folder), {"time": time, "sun": None})
+        whole.append(load_source(folder, None).gaussians.sh[:, 0])
+    put = [one[len(load_source(folder).gaussians) :].mean() for one in whole]
+    assert put[1] < put[0] - 0.1 and put[2] == put[0]
+    assert read_edits(folder) == [EDIT, chair] and read_edits(folder, UNDONE_FILE) == [chair]
+
+
+@pytest.mark.parametrize(
+    ("name", "later"),
+    [
+        ("a bright kitchen at noon", "a bright kitchen in the evening"),
+        ("an overcast loft with a lamp", "a loft with a lamp in the evening"),
+        ("a sunny attic", "an attic in the evening"),
+        ("a library on a cloudy day", "a library in the evening"),
+        ("flat", "flat"),
+    ],
+)
+def test_a_time_in_the_name_changes_with_the_light(name, later):
+    assert name_at(name, "evening") == later
 
 
 def test_what_cannot_be_lit_anew_stays_as_it_is(folder, tmp_path):

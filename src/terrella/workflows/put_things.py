@@ -58,12 +58,36 @@ def _saved(folder: Path, request: FurnitureRequest, style: str, time: str) -> tu
     key = json.dumps([request.label, request.look, request.scale, style, time])
     home = folder / THINGS / f"{request.label}-{hashlib.sha256(key.encode()).hexdigest()[:8]}"
     if not (home / "world.json").exists():
-        save_splat(_world_of(build_thing(request, style, time)), home)
+        words = {"label": request.label, "look": request.look, "scale": list(request.scale), "style": style}
+        save_splat(_world_of(build_thing(request, style, time), words), home)
     return load_source(home).card, home
 
 
-def _world_of(thing: BuiltThing) -> SplatWorld:
-    card = {"objects": [thing.name], "size": list(thing.size), "stands": thing.stands, "hangs_m": thing.hangs_m}
+def relit_things(folder: Path, edits: Sequence[Edit], time: str) -> list[Edit]:
+    """The edits of the place in `folder` with the furniture that was put there lit at another time of day. Furniture whose card
+    has no request stays as it is."""
+
+    def relit(edit: Edit) -> Edit:
+        place = Path(edit["place"]) if edit["do"] == "merge" else None
+        words = load_source(folder / place).card.get("request") if place and place.parent == Path(THINGS) else None
+        if words is None:
+            return edit
+        request = FurnitureRequest(words["label"], 1, words["look"], tuple(words["scale"]))
+        _, home = _saved(folder, request, words["style"], time)
+        return {**edit, **merge_edit(folder, home, edit["by"], edit["degrees"])}
+
+    return [relit(edit) for edit in edits]
+
+
+def _world_of(thing: BuiltThing, request: Mapping[str, Any]) -> SplatWorld:
+    """A thing as a place. request: label, look, scale and style, of which it is built again by another light."""
+    card = {
+        "objects": [thing.name],
+        "size": list(thing.size),
+        "stands": thing.stands,
+        "hangs_m": thing.hangs_m,
+        "request": request,
+    }
     many = len(thing.gaussians)
     return SplatWorld(
         thing.name, thing.gaussians, torch.full((many,), INVENTED, dtype=torch.uint8), torch.tensor([[0.0, -2, 1.65, 1, 0, 0, 0]]),
