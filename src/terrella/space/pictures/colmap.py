@@ -10,10 +10,13 @@ import torch
 
 from ...core.errors import DatasetError
 from .locating import locate
-from .posed import Lens, Shots, absent, levelled, pose_of
+from .posed import FAR, FEWEST, Lens, Shots, absent, levelled, pose_of
+from .turning import Pair, rotation_error
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "0", ".")
 _MANY = 120  # pictures; of more, each is compared with its successors alone
+_TURNED = 1 / 640  # of the longest side: a smaller error of rotations alone means that the camera only turned
+_FEWEST_MATCHES = 30  # of a pair whose rotation is fitted
 
 
 def _pycolmap() -> Any:
@@ -106,13 +109,25 @@ def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
     try:
         colmap.extract_features(database, images, camera_mode=cameras, extraction_options=features)
         (colmap.match_sequential if film and count > _MANY else colmap.match_exhaustive)(database)
+        if (error := rotation_error(_pairs(colmap, database))) is not None and error < _TURNED:
+            raise DatasetError(
+                f"the camera only turned: rotations alone explain the pictures, to {100 * error:.2f}% of their longer side, "
+                "and so they show no depth. Walk while you take them, or stitch them to a panorama for `terrella space lift`."
+            )
         models = colmap.incremental_mapping(database, images, work, options=plan)
         best = max(models.values(), key=lambda one: one.num_reg_images()) if models else None
         placed = best.num_reg_images() if best else 0
-        if best is None or placed < 3:
+        if best is None or placed < FEWEST:
             raise DatasetError(
-                f"{placed} of {count} pictures could be placed: they overlap too little, are blurred, or were all taken "
-                "from one spot. Walk while you take them, so that each shows most of what its neighbours show."
+                f"{placed} of {count} pictures could be placed, and a fit needs {FEWEST}: they overlap too little, are blurred, "
+                "show a pattern that repeats (bricks), or were all taken from one spot. Walk while you take them, so that each "
+                "shows most of what its neighbours show."
+            )
+        places = np.array([one.projection_center() for one in best.images.values() if one.has_pose])
+        if not (np.abs(places) < FAR).all():
+            raise DatasetError(
+                "the pictures contradict one another: their poses run off. Patterns that repeat (bricks) and cameras that "
+                "only turn do that; take pictures while you walk, of things that differ."
             )
         model = folder / "sparse" / "0"
         model.mkdir(parents=True, exist_ok=True)
@@ -123,3 +138,22 @@ def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
         shutil.rmtree(work, ignore_errors=True)
         database.unlink(missing_ok=True)
     return placed
+
+
+def _pairs(colmap: Any, database: Path) -> list[Pair]:
+    """The matches of all pairs of pictures in a database that fit one geometry."""
+    with colmap.Database.open(database) as stored:
+        cameras = {one.camera_id: one for one in stored.read_all_cameras()}
+        points, sizes = {}, {}
+        for image in stored.read_all_images():
+            camera = cameras[image.camera_id]
+            sizes[image.image_id] = max(camera.width, camera.height)
+            keypoints = np.asarray(stored.read_keypoints(image.image_id), float)[:, :2]
+            points[image.image_id] = keypoints - [camera.width / 2, camera.height / 2]
+        pairs = []
+        for number, geometry in zip(*stored.read_two_view_geometries()):
+            one, two = colmap.pair_id_to_image_pair(number)
+            rows = np.asarray(geometry.inlier_matches)
+            if len(rows) >= _FEWEST_MATCHES and sizes[one] == sizes[two]:
+                pairs.append((points[one][rows[:, 0]], points[two][rows[:, 1]], sizes[one]))
+    return pairs

@@ -17,6 +17,7 @@ from ..raster.move import multiply_quaternions, quaternion_of
 from .reading import ENDINGS, blurred, read_picture, sharpness
 
 FEWEST = 8  # pictures of a fit
+FAR = 1e6  # units that a camera is away at most
 MIDDLE_M = 3.0  # how far away the middle point lies where nothing says how long a unit is
 
 
@@ -75,7 +76,7 @@ def shown_name(file: Path) -> str:
 
 def pose_of(rot: np.ndarray, place: np.ndarray, where: str) -> torch.Tensor:
     """The pose [7] of a rotation with columns forward, left and up, and a place; DatasetError if it is none."""
-    good = np.isfinite(rot).all() and np.isfinite(place).all() and np.abs(place).max() < 1e6
+    good = np.isfinite(rot).all() and np.isfinite(place).all() and np.abs(place).max() < FAR
     if not good or np.abs(rot.T @ rot - np.eye(3)).max() > 0.01 or np.linalg.det(rot) < 0:
         raise DatasetError(f"{where}: its pose is no rotation and a place of finite numbers; mend or remove it.")
     return torch.cat([torch.from_numpy(place).float(), quaternion_of(torch.from_numpy(rot))])
