@@ -82,16 +82,21 @@ def test_files_that_the_page_asks_for(folder):
 
 
 def test_a_film_ends_when_nobody_waits_for_it(folder, serving):  # noqa: F811
+    def stop(done: int, total: int) -> None:
+        raise TerrellaError("stopped")
+
     with pytest.raises(TerrellaError, match="stopped"):
-        exported_file(str(folder), {"kind": "mp4", "path": PATH, "seconds": 9, "exposure": 0}, lambda: True)
+        exported_file(str(folder), {"kind": "mp4", "path": PATH, "seconds": 9, "exposure": 0}, stop)
     ended = threading.Event()
 
-    def export(wish, gone):
-        for _ in range(300):
-            if gone():
-                ended.set()
-                break
-            time.sleep(0.05)
+    def export(wish, drawing):
+        try:
+            for number in range(300):
+                drawing(number, 300)
+                time.sleep(0.05)
+        except TerrellaError:
+            ended.set()
+            raise
         return b"film"
 
     url = serving(build_place(replace(editable_place(str(folder)), export=export)))
@@ -99,6 +104,10 @@ def test_a_film_ends_when_nobody_waits_for_it(folder, serving):  # noqa: F811
     with pytest.raises(TimeoutError):
         urllib.request.urlopen(urllib.request.Request(url + "files", data=wish), timeout=1)
     assert ended.wait(10)
+    done, total = json.loads(
+        urllib.request.urlopen(urllib.request.Request(url + "drawn", data=b"{}"), timeout=9).read()
+    )
+    assert 0 < done < total == 300
 
 
 def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # noqa: F811
@@ -125,6 +134,10 @@ def test_a_path_is_kept_previewed_and_downloaded(folder, opened, serving):  # no
     page.fill("[data-film=seconds]", "1e9")
     page.click("[data-file=mp4]")
     assert page.input_value("[data-film=seconds]") == "120"
+    until(
+        page,
+        "/^Drawing picture \\d+ of 3600, \\d+ s left/.test(document.querySelector('[data-film=state]').textContent)",
+    )
     page.click("[data-file=mp4]")
     until(page, "document.querySelector('[data-film=state]').textContent === 'The film was stopped.'")
     page.focus("[data-film=exposure]")  # keys still walk

@@ -19,6 +19,7 @@ from ..workflows.editable_place import editable_place
 from ..workflows.export_space import ExportSpaceConfig, export_space
 from ..workflows.grow_space import GrowSpaceConfig, grow_space
 from ..workflows.lift_space import LiftSpaceConfig, lift_space
+from ..workflows.progress import stage
 from ..workflows.results import command
 from .say import Host, Json, PlaceName, Port, RecordingName, Token, opened, say, show
 
@@ -105,7 +106,9 @@ def export(
         world: A world of Gaussians: its folder, or the run that made it.
         file: The file to write. Its ending decides the format.
     """
-    show(export_space(world, file, config), json)
+    with stage("drawing", say) as drawing:
+        result = export_space(world, file, config, drawing)
+    show(result, json)
 
 
 def view(

@@ -252,7 +252,8 @@ class EditablePlace:
     beside: PlaceScene | None = None  # a place to compare it with
     merge: Edit | None = None  # the edit that merges that place; None where it cannot be merged
     put: Callable[[str, Spot], PutThings] | None = None  # builds what words name; may raise a TerrellaError
-    export: Callable[[Mapping[str, Any], Gone], bytes] | None = None  # writes a file; may raise a TerrellaError
+    # Writes a file; calls a function before each of its pictures with their number so far and in all. May raise a TerrellaError.
+    export: Callable[[Mapping[str, Any], Callable[[int, int], None]], bytes] | None = None
     light: Callable[[], Mapping[str, Any] | None] | None = (
         None  # of a built place: time, sun, and the times that there are
     )
@@ -262,10 +263,10 @@ class EditablePlace:
 
 def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None = None) -> Starlette:
     """The ASGI application of a place: its page with the edits so far; /edits, to which the page posts the edits that it believes
-    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; /relight, which bakes
-    another light; and /collider, what stops walkers after edits."""
+    to be saved and those to save; /things, which builds furniture by words; /files, which writes the place; /drawn, how many
+    pictures of a film are drawn; /relight, which bakes another light; and /collider, what stops walkers after edits."""
     scene, page, lock = place.scene, PlacePage(place.scene, place.beside, place.merge), threading.Lock()
-    writing = threading.Lock()  # one file at a time, while edits go on
+    writing, drawn = threading.Lock(), [0, 0]  # one file at a time, while edits go on; pictures so far and in all
 
     def save(content: bytes, _: Gone) -> None:
         posted_edits = _wished(place, content)
@@ -279,7 +280,7 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         wish = _wished(place, content)
         assert place.export is not None
         with writing:
-            return place.export(wish, gone)
+            return place.export(wish, _counting(drawn, gone))
 
     def build_things(content: bytes, _: Gone) -> bytes:
         wish = _wished(place, content)
@@ -304,6 +305,7 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
         ("edits", save, LONGEST_EDITS, "edits are lines of JSON"),
         ("things", build_things if place.put else None, LONGEST_WISH, "a thing has words and a spot"),
         ("files", write_file if place.export else None, LONGEST_WISH, "a file has a kind"),
+        ("drawn", lambda *_: json.dumps(drawn).encode(), LONGEST_WISH, "no content is read"),
         ("relight", relight if place.relight else None, LONGEST_WISH, "a light has a time of day"),
         ("collider", close if scene.collider_after else None, LONGEST_EDITS, "edits are lines of JSON"),
     ]
@@ -314,6 +316,18 @@ def build_place(place: EditablePlace, host: str = "127.0.0.1", token: str | None
     light = place.light or (lambda: None)
     html = lambda: page.html(place.edits(), "/edits", more={**more, "light": light()})  # noqa: E731
     return application(html, routes, None, host, token, page.policy)
+
+
+def _counting(drawn: list[int], gone: Gone) -> Callable[[int, int], None]:
+    """Keeps the pictures so far and in all in `drawn`; ServeError once nobody waits for them."""
+    drawn[:] = 0, 0
+
+    def count(done: int, total: int) -> None:
+        if gone():
+            raise ServeError("the film was stopped.")
+        drawn[:] = done, total
+
+    return count
 
 
 def _edits_of(page: PlacePage, lines: str) -> list[Edit]:

@@ -30,7 +30,7 @@ def editable_place(world: str, beside: str | None = None) -> EditablePlace:
         None if beside is None else compared_scene(beside),
         None if beside is None or Path(beside).is_file() else _merge_of(folder, beside),
         lambda words, spot: put_things(folder, words, spot),
-        lambda wish, gone: exported_file(world, wish, gone),
+        lambda wish, drawing: exported_file(world, wish, drawing),
         lambda: light_of(world),
         None if light_of(world) is None else lambda light: _relit(world, light),
         hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],

@@ -48,6 +48,7 @@ MOST_STOPS, GAMMA = 4.0, 2.2  # of an exposure; of the pictures
 EXPORTS = ("spz", "ply", "glb", "gaussians.glb", "mp4")  # what the page of a place downloads
 LONGEST_S = 120  # of a film that the page asks for
 MOST_FACES = 5_000_000
+Drawing = Callable[[int, int], None]  # pictures of a film that are drawn so far, and in all
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,10 @@ class ExportSpaceConfig:
 
 
 def export_space(
-    world: str, file: Path, config: ExportSpaceConfig, gone: Callable[[], bool] = lambda: False
+    world: str, file: Path, config: ExportSpaceConfig, drawing: Drawing = lambda done, total: None
 ) -> SpaceResult:
-    """Writes a world of Gaussians to `file`, whose ending decides the format. The file is replaced as a whole. gone: whether
-    nobody waits for a film any longer, which ends it with a TerrellaError."""
+    """Writes a world of Gaussians to `file`, whose ending decides the format. The file is replaced as a whole. drawing: called
+    before each picture of a film with their number so far and in all; an error that it raises ends the film."""
     suffix = file.suffix.lower()
     for field in fields(config):
         if getattr(config, field.name) != field.default and suffix not in OPTIONS[field.name]:
@@ -88,7 +89,7 @@ def export_space(
         scene = unedited_scene(world)
         content, facts = PlacePage(scene).html(read_edits(folder_of(world))), {"gaussians": len(scene.gaussians)}
     elif suffix in (".glb", ".png", ".mp4"):
-        content, facts = _drawn(open_splat(world), suffix, config, gone)
+        content, facts = _drawn(open_splat(world), suffix, config, drawing)
     else:
         shown = _opaque(open_splat(world).gaussians)
         write_scene(shown, file, config.axes, "compressed" if config.compressed else "", config.spz)
@@ -98,9 +99,9 @@ def export_space(
     return SpaceResult({**facts, "bytes": file.stat().st_size, "file": str(file)})
 
 
-def exported_file(world: str, wish: Mapping[str, Any], gone: Callable[[], bool] = lambda: False) -> bytes:
+def exported_file(world: str, wish: Mapping[str, Any], drawing: Drawing = lambda done, total: None) -> bytes:
     """The content of a file that the page of a place asks for: {"kind": one of EXPORTS, and of a film "path", "seconds" and
-    "exposure"}. TerrellaError for what cannot be written."""
+    "exposure"}. drawing: as of `export_space`. TerrellaError for what cannot be written."""
     kind = wish.get("kind")
     if kind not in EXPORTS:
         raise TerrellaError(f"the page writes {', '.join(EXPORTS)}; reload it.")
@@ -113,7 +114,7 @@ def exported_file(world: str, wish: Mapping[str, Any], gone: Callable[[], bool] 
                 raise TerrellaError(f"a film has seconds, {LONGEST_S} at most, and an exposure in stops.")
             path.write_text(json.dumps(wish.get("path")))
             config = ExportSpaceConfig(seconds=seconds, path=path, aspect=16 / 9, exposure=exposure)
-        export_space(world, file, config, gone)
+        export_space(world, file, config, drawing)
         return file.read_bytes()
 
 
@@ -123,7 +124,7 @@ def _opaque(gaussians: Gaussians) -> Gaussians:
 
 
 def _drawn(
-    world: SplatWorld, suffix: str, config: ExportSpaceConfig, gone: Callable[[], bool]
+    world: SplatWorld, suffix: str, config: ExportSpaceConfig, drawing: Drawing
 ) -> tuple[bytes, Mapping[str, Any]]:
     """A mesh, a panorama or a film: the bytes of its file, and its figures."""
     if not len(world.gaussians):
@@ -135,7 +136,7 @@ def _drawn(
     with torch.no_grad():
         if suffix == ".glb":
             return _glb(world, config)
-        return _panorama(world, config) if suffix == ".png" else _film(world, config, gone)
+        return _panorama(world, config) if suffix == ".png" else _film(world, config, drawing)
 
 
 def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str, Any]]:
@@ -170,7 +171,7 @@ def _panorama(world: SplatWorld, config: ExportSpaceConfig, height: int = 1024) 
     return buffer.getvalue(), {"size": [2 * height, height], "pose": [round(v, 3) for v in pose.tolist()]}
 
 
-def _film(world: SplatWorld, config: ExportSpaceConfig, gone: Callable[[], bool]) -> tuple[bytes, dict[str, Any]]:
+def _film(world: SplatWorld, config: ExportSpaceConfig, drawing: Drawing) -> tuple[bytes, dict[str, Any]]:
     if not 0.5 <= config.seconds <= 600:
         raise TerrellaError("--seconds is from 0.5 to 600.")
     count, height = round(config.seconds * FRAMES_PER_S), 480
@@ -181,8 +182,7 @@ def _film(world: SplatWorld, config: ExportSpaceConfig, gone: Callable[[], bool]
     camera = world.config.camera if config.aspect is None else (wide, wide * aspect, middle[0], middle[1])
     pictures = []
     for pose in poses:
-        if gone():
-            raise TerrellaError("the film was stopped.")
+        drawing(len(pictures), count)
         seen = rasterise(world.gaussians, pose[None], camera, size).rgb[0]
         picture = _exposed(seen, config.exposure)
         pictures.append((simplejpeg.encode_jpeg(picture, quality=95, colorspace="RGB", colorsubsampling="444"),))

@@ -88,7 +88,7 @@ function run({ drawing, drawingOn, source, story, solid: first }) {
   const film = new Film($('film'), {
     eye: () => walker.eye, stand: ([x, y, z, heading, pitch]) => { if (orbit.on) turnAround(); walker.set([x, y, z], heading, pitch, true); redraw(); },
     picture, unsaved: () => story.unsaved, expose: (stops) => { drawing.stops = stops; redraw(); }, redraw: () => redraw(), say: toast,
-    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', kept: `terrella-film ${[world.name, world.key || world.count, ...world.starts[0]].join()}`, address: world.files, command: world.command, key: world.key,
+    name: world.name.replace(/[^\w]+/g, '-').replace(/^-|-$/g, '').slice(0, 60) || 'place', kept: `terrella-film ${[world.name, world.key || world.count, ...world.starts[0]].join()}`, address: world.files, drawn: world.drawn, command: world.command, key: world.key,
   });
 
   new Light($('light'), {

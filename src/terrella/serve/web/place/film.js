@@ -2,7 +2,7 @@
 
 import { reach } from './reach.js';
 
-const STARTS = 0.12, FEWEST = 2, MOST = 60, COLOUR = [0.94, 0.76, 0.45, 0.9], TURN = 2 * Math.PI;
+const COUNT_MS = 500, STARTS = 0.12, FEWEST = 2, MOST = 60, COLOUR = [0.94, 0.76, 0.45, 0.9], TURN = 2 * Math.PI;
 const ENDINGS = { 'gaussians.glb': 'glb', mp4: 'mp4', spz: 'spz', ply: 'ply', glb: 'glb', png: 'png' };
 const round = (value) => Math.round(value * 1000) / 1000;
 
@@ -18,7 +18,7 @@ export function glideAt(views, share) {
 
 export class Film {
   /** panel: its parts are named by data-film and data-file; on: eye(), stand(view), picture() -> promise of a blob, unsaved(), expose(stops),
-   * redraw(), say(text), name, kept (under which name the browser keeps the path), address, command, key. */
+   * redraw(), say(text), name, kept (under which name the browser keeps the path), address, drawn (the address that counts pictures), command, key. */
   constructor(panel, on) {
     Object.assign(this, { panel, on, views: [], playing: 0, open: false });
     const part = (name) => panel.querySelector(`[data-film=${name}]`);
@@ -120,6 +120,7 @@ export class Film {
     const stop = new AbortController();
     if (kind === 'mp4') this.filming = stop; else button.disabled = true;
     this.parts.state.textContent = kind === 'mp4' ? `Drawing ${Math.round(30 * this.seconds)} pictures … MP4 again stops it.` : `Writing the ${button.textContent} …`;
+    const counting = kind === 'mp4' ? setInterval(() => this.count(performance.now() - began), COUNT_MS) : 0, began = performance.now();
     try {
       const blob = kind === 'png' ? await this.on.picture() : await (await reach(this.on.address + location.search, this.on.command, { method: 'POST', body: JSON.stringify(wish), signal: stop.signal })).blob();
       const anchor = Object.assign(document.createElement('a'), { href: URL.createObjectURL(blob), download: `${this.on.name}.${ENDINGS[kind]}` });
@@ -130,7 +131,17 @@ export class Film {
       this.parts.state.textContent = stop.signal.aborted ? 'The film was stopped.' : '';
       if (!stop.signal.aborted) this.on.say(error.message);
     }
+    clearInterval(counting);
     if (kind === 'mp4') this.filming = null; else button.disabled = false;
+  }
+
+  /** Shows how much of a film is drawn after `took` milliseconds. */
+  async count(took) {
+    try {
+      const stop = this.filming, [done, total] = await (await reach(this.on.drawn + location.search, this.on.command, { method: 'POST' })).json();
+      if (!done || stop !== this.filming) return;
+      this.parts.state.textContent = `Drawing picture ${done + 1} of ${total}, ${Math.ceil(((total - done) / done) * took / 1000)} s left … MP4 again stops it.`;
+    } catch { /* the film itself says what is wrong */ }
   }
 
   /** The path as lines. */
