@@ -19,6 +19,7 @@ from ..core.world import Observation
 from .actor import load_network, write_policy
 from .actor_network import ActorConfig
 from .choices import Choices
+from .embodiment import EMBODIMENT, Embodiment, index_of
 from .imitation_network import FLOW_STEPS, TEXT, ImitationConfig, ImitationNetwork
 from .sentences import WORDS
 
@@ -41,6 +42,8 @@ class ImitationActor:
         network.config.check(spec)
         self.network, self.spec, self.card, self.std = network, spec, dict(card or {}), std
         self._warned: set[str] = set()
+        bodies = network.config.bodies
+        self._body = torch.eye(len(bodies))[[index_of(bodies, spec)]] if bodies else None  # [1, bodies]
 
     @property
     def sees(self) -> tuple[str, ...]:
@@ -74,6 +77,8 @@ class ImitationActor:
         network, config, batch = self.network, self.network.config, memory.batch
         if missing := [name for name in self.sees if name not in observation]:
             raise ChannelError(f"the policy sees {', '.join(missing)}, which the observation lacks.")
+        if self._body is not None:
+            observation = {**observation, EMBODIMENT: self._body.expand(batch, -1)}
         spoken, words = self._words(observation[TEXT]) if network.words is not None else (memory["words"], None)
         device, features = network.mean.device, network.features(observation, words)[:, None]
         if config.remember:
@@ -145,6 +150,9 @@ def load_imitation_network(folder: str | Path) -> tuple[ImitationNetwork, dict[s
     """The network of a saved policy, and its card. CheckpointError if it is missing or foreign."""
 
     def make(config: dict[str, Any]) -> ImitationNetwork:
-        return ImitationNetwork(ImitationConfig(**{**config, "actor": ActorConfig(**config["actor"])}))
+        bodies = tuple(Embodiment(**body) for body in config.get("bodies", ()))
+        return ImitationNetwork(
+            ImitationConfig(**{**config, "actor": ActorConfig(**config["actor"]), "bodies": bodies})
+        )
 
     return load_network(folder, KIND, VERSION, make)

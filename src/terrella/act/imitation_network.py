@@ -14,6 +14,7 @@ from torch import nn
 from ..core.errors import ChannelError
 from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
 from .actor_network import AXES, MAX_SYMLOG, ActorConfig, mlp, symlog
+from .embodiment import EMBODIMENT, Embodiment, index_of
 from .sentences import WordEncoder
 
 TEXT = "text"
@@ -29,7 +30,7 @@ FLOW_STEPS = 8  # Euler steps from noise to a chunk
 class ImitationConfig:
     """The inputs, the actions and the size of an imitating policy."""
 
-    actor: ActorConfig  # channels, actions and width
+    actor: ActorConfig  # channels, actions and width; the actions of the body that has most numbers
     size: tuple[int, int] = (64, 64)  # height and width to which pictures are resized
     vocabulary: tuple[str, ...] = ()  # words of the instructions; () for a policy without
     history: int = 2  # observations that it sees, the last ones
@@ -42,6 +43,7 @@ class ImitationConfig:
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
     )
+    bodies: tuple[Embodiment, ...] = ()  # that it drives, of which it sees which one; (): one, of any name
 
     @property
     def sees(self) -> tuple[str, ...]:
@@ -64,7 +66,7 @@ class ImitationConfig:
 
     def check(self, spec: Spec) -> None:
         """ActionError or ChannelError if `spec` has other actions, or lacks a channel in this form. Pictures may have any size."""
-        replace(self.actor, sees=()).check(spec)
+        replace(self.actor_of(spec), sees=()).check(spec)
         for name, shape in self.actor.sees:
             spec.check_channels((name,))
             other = shape_of(spec.channels[name])
@@ -73,11 +75,20 @@ class ImitationConfig:
         if self.vocabulary and TEXT not in spec.channels:
             raise ChannelError(f"the policy follows instructions, and {spec.name} gives none (no channel '{TEXT}').")
 
+    def actor_of(self, spec: Spec) -> ActorConfig:
+        """The actor with the actions of the body that `spec` drives; ActionError where that is none of several bodies."""
+        if not self.bodies:
+            return self.actor
+        body = self.bodies[index_of(self.bodies, spec)]
+        return replace(self.actor, shape=body.shape, low=body.low, high=body.high)
+
     def decode(self, encoded: torch.Tensor, spec: Spec) -> torch.Tensor:
         """Encoded actions [N, action_width] (choices one-hot, buttons 0 or 1, axes from -1 to 1) in the space of `spec`:
         [N, *action.shape]."""
         if self.actor.mode == AXES:
-            return self.actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
+            actor = self.actor_of(spec)
+            encoded = encoded[:, : len(actor.low)]
+            return actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
         if self.actor.mode == BUTTONS:
             return self.actor.actions(encoded, spec)
         parts = encoded.split(list(self.actor.counts), 1)
@@ -190,7 +201,7 @@ class ImitationNetwork(nn.Module):
             changes = (config.window - 1) * width
         self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, self.words) for _, shape in self._arrays)
         self.attended = 2 * picks * pictures if words else 0
-        self.width = width + actor.hidden * len(self.looks) + self.attended
+        self.width = width + len(config.bodies) + actor.hidden * len(self.looks) + self.attended
         foresees = config.waypoints if width and self.attended else 0
         self.waypoints = nn.ModuleList(
             _Waypoint(2 * QUERIES * pictures, words, actor.hidden, width) for _ in range(foresees)
@@ -209,6 +220,8 @@ class ImitationNetwork(nn.Module):
         device, parts = self.mean.device, []
         if self._vectors:
             parts.append(self.numbers(seen))
+        if self.config.bodies:
+            parts.append(seen[EMBODIMENT].to(device))
         looks = [look(seen[name].to(device), words) for look, (name, _) in zip(self.looks, self._arrays)]
         hidden = self.config.actor.hidden
         return torch.cat([*parts, *(look[:, :hidden] for look in looks), *(look[:, hidden:] for look in looks)], 1)

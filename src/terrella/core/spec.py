@@ -107,6 +107,7 @@ class Spec:
     leap: int = 0  # steps that `leap` advances at once (core/world.py); 0 for worlds without it
     system: Mapping[str, object] = field(default_factory=dict)
     """Bodies, walls and limits for the laws of physics, JSON values (physics/system.py); {} where they are unknown."""
+    embodiment: str = ""  # the body that actions drive, whatever its task ("mujoco:table-yam"); "" for the world's name
 
     def __post_init__(self):
         if not self.action_mode:

@@ -90,7 +90,8 @@ def facts_of(spec: Spec) -> dict[str, object]:
     low, high = (np.asarray(limit, np.float64).ravel().tolist() for limit in spec.action_limits)
     limits = {"action_low": low, "action_high": high} if np.isfinite([low, high]).all() else {}
     return {
-        "name": spec.name, "dt_s": spec.dt_s, "camera": list(spec.camera) if spec.camera else None,
+        "name": spec.name, "embodiment": spec.embodiment or spec.name, "dt_s": spec.dt_s,
+        "camera": list(spec.camera) if spec.camera else None,
         "cameras": {channel: _camera_json(camera) for channel, camera in spec.cameras.items()},
         "action_space": str(spec.action), "action_shape": list(shape_of(spec.action)),
         "action_names": list(spec.action_names), "action_units": list(spec.action_units),

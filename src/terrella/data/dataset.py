@@ -166,6 +166,11 @@ class Dataset:
                 return stream
         return self._of_rows(self._episode(number), name, self.time_s(number))  # at the times of the rows
 
+    @property
+    def embodiment(self) -> str:
+        """The body that its actions drove: the recorded world's, else LeRobot's robot_type; "" where neither is known."""
+        return str(self.world.get("embodiment") or self.world.get("name") or self.info.get("robot_type") or "")
+
     def source(self) -> Source:
         """The recording as a Source: sensors at the times of the rows, streams at their own."""
         sensors = {**self.sensors, **self.streams}
@@ -173,7 +178,7 @@ class Dataset:
         ours = ("version", "sensors", "streams", "channels", "terminal", "pose", "depth_unit_m", "depth_beyond")
         facts = {key: value for key, value in self.about.items() if key not in ours}
         takes = Lazy(len(self.episodes), self._take)
-        return Source(self.name, sensors, lambda: takes, rate, str(self.info.get("robot_type") or ""), (), facts)
+        return Source(self.name, sensors, lambda: takes, rate, self.embodiment, (), facts)
 
     # -- one episode ---------------------------------------------------------------------------------------------
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
+from ..act.embodiment import EMBODIMENT
 from ..act.imitation_network import ImitationConfig
 from ..act.sentences import WordEncoder
 from ..act.teacher import EXPERT
@@ -35,6 +37,7 @@ class DemonstrationRows:
     weight: torch.Tensor | None = None  # float32 [R], of each row's action in the loss; None: 1
     taken: torch.Tensor | None = None  # float32 [R, A], encoded, that were taken; None: those that are imitated
     ahead: int = 0  # observations after the moment that are seen, too, as the last of the history
+    body: int | None = None  # which of the policy's bodies acted; None for a policy of one body
 
     @staticmethod
     def of(recording: Recording, config: ImitationConfig, device: torch.device) -> DemonstrationRows:
@@ -54,13 +57,17 @@ class DemonstrationRows:
         if cache.action is None:  # clips: every row but an episode's last has an action that nobody recorded
             actions, valid = torch.zeros(cache.length, config.action_width), np.arange(cache.length) < stop - 1
         else:
-            actions = recording.action(np.arange(cache.length))
+            actions = _padded(recording.action(np.arange(cache.length)), config.action_width)
             valid = np.array(cache.action_valid, bool).reshape(-1)
         rows, sure = np.flatnonzero(recording.usable & valid), cache.arrays.get(CONFIDENCE)
         if not len(rows):
             raise DatasetError(f"{recording.name} holds no actions to imitate; record demonstrations.")
         weight = None if sure is None else torch.from_numpy(np.array(sure, np.float32).reshape(-1))
-        return DemonstrationRows(recording, config, device, rows, valid, stop, actions, words, outcome, weight)
+        bodies = [one.name for one in config.bodies]
+        body = bodies.index(recording.embodiment) if bodies else None
+        return DemonstrationRows(
+            recording, config, device, rows, valid, stop, actions, words, outcome, weight, body=body
+        )
 
     @property
     def advised(self) -> DemonstrationRows:
@@ -74,7 +81,7 @@ class DemonstrationRows:
         expert = torch.from_numpy(np.array(cache.arrays[array], np.float32)).flatten(1)
         if expert.shape[1] != len(controls.low):
             return self
-        actions = controls.encode(expert)
+        actions = _padded(controls.encode(expert), self.config.action_width)
         for number in cache.absent.get(array, ()):  # where it is padding
             alone = slice(*cache.episodes[number])
             actions[alone] = self.actions[alone]
@@ -151,6 +158,8 @@ class DemonstrationRows:
             array = array_for(name, cache.arrays, cache.keys)
             assert array is not None
             seen[name] = torch.from_numpy(np.asarray(cache.arrays[array][rows])).to(self.device)
+        if self.body is not None and not numbers_only:
+            seen[EMBODIMENT] = torch.eye(len(self.config.bodies))[[self.body]].expand(len(rows), -1).to(self.device)
         return seen
 
     def _moments(self, rows: np.ndarray, back: np.ndarray, shown: np.ndarray, spoken: np.ndarray) -> Demonstrations:
@@ -179,3 +188,23 @@ class DemonstrationRows:
             seen, acted.to(self.device), chunk.to(self.device), weight.to(self.device), words, outcome,
             waypoints=waypoints, begins=begins,
         )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class JointDemonstrations:
+    """The rows of several recordings, of one body or several, each as likely as another."""
+
+    parts: tuple[DemonstrationRows, ...]
+
+    def sample(self, count: int, rng: np.random.Generator) -> Demonstrations:
+        """`count` moments. Those of one recording are drawn as by itself."""
+        if len(self.parts) == 1:
+            return self.parts[0].sample(count, rng)
+        rows = np.array([len(part.rows) for part in self.parts], np.float64)
+        counts = rng.multinomial(count, rows / rows.sum())
+        return Demonstrations.joined([part.sample(int(n), rng) for part, n in zip(self.parts, counts) if n])
+
+
+def _padded(actions: torch.Tensor, width: int) -> torch.Tensor:
+    """Encoded actions [N, A] of a body with fewer numbers than others: [N, width], the rest 0."""
+    return F.pad(actions, (0, width - actions.shape[1]))

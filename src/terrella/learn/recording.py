@@ -115,6 +115,11 @@ class Recording:
         return "the recording" if self.dataset is None else str(self.dataset.root)
 
     @property
+    def embodiment(self) -> str:
+        """The body that its actions drove; "" where it is not known."""
+        return "" if self.dataset is None else self.dataset.embodiment
+
+    @property
     def seen(self) -> list[int]:
         """The episodes for training."""
         return [number for number in range(len(self.cache.episodes)) if number not in self.held_out]

@@ -99,6 +99,7 @@ class MujocoWorld:
     def __init__(self, name: str | Path | Robot, config: MujocoConfig = MujocoConfig()):
         label = name.file if isinstance(name, Robot) else str(name)
         robot = name if isinstance(name, Robot) else None if label.endswith(FILES) else robot_of(label)
+        self._embodiment = f"mujoco:{label}"
         task = config.task
         if isinstance(task, str):
             if robot is None:
@@ -387,6 +388,7 @@ class MujocoWorld:
             cameras={} if "camera.fov" in self.varied else cameras,
             max_episode_steps=self._limit,
             system=self._system,
+            embodiment=self._embodiment,
             card={
                 "what": self._what, "kind": "simulator", "physics": _physics_text(model, self._steps), "varied": list(self.varied),
                 "together": True, **({"notes": notes} if notes else {}),

@@ -39,8 +39,9 @@ class TrainPolicyConfig:
     out: Path  # Folder of the run: the policy, its checkpoint and a log.
     practice: Practice = Practice()
     imitation: Imitation = Imitation()
-    recording: Annotated[str | None, arg(name="from")] = None
-    """A recording in whose states practice begins (default: where the world's own episodes begin), or that is imitated."""
+    recording: Annotated[tuple[str, ...], arg(name="from")] = ()
+    """A recording in whose states practice begins (default: where the world's own episodes begin), or that is imitated; several
+    are imitated by one policy, which drives each of their bodies."""
     grow: bool = False
     """Start with --randomise ranges of width zero and widen them to those of the file as the policy's return
     holds up."""
@@ -49,6 +50,10 @@ class TrainPolicyConfig:
     episodes: int = 20  # Episodes of that trial.
     device: Device = "auto"
     environment: EnvironmentConfig = EnvironmentConfig()
+
+    def __post_init__(self):
+        if isinstance(self.recording, str):
+            object.__setattr__(self, "recording", (self.recording,))
 
 
 @dataclass(frozen=True)
@@ -130,6 +135,8 @@ def train_policy(
         raise TerrellaError(
             "say in which world the policy practises, --in WORLD, or --method imitation --from RECORDING."
         )
+    if len(config.recording) > 1:
+        raise TerrellaError("--from: practice begins in the states of one recording; only imitation takes several.")
     environment, world, out = config.environment, str(world), Path(config.out)
     if config.grow and environment.randomise is None:
         raise TerrellaError("--grow widens the ranges of a file: name it with --randomise FILE.")
@@ -142,7 +149,8 @@ def train_policy(
     growing = cast(Scaled, inside) if config.grow else None
     practice = practice_within_trust(inside, config.practice, progress)
     with stage("practising", progress) as report:
-        facts = recipe.train_policy(inside, world, out, practice, report, config.recording, growing=growing)
+        began = next(iter(config.recording), None)
+        facts = recipe.train_policy(inside, world, out, practice, report, began, growing=growing)
     if outside is None:
         return TrainPolicyResult(world, facts, None)
     trial = try_policy(out, inside, outside, config.episodes, config.practice.seed, progress)
@@ -158,7 +166,7 @@ def _imitate(world: str | Path | None, config: TrainPolicyConfig, progress: Prog
         raise TerrellaError(
             f"{_flags(useless) or '--grow'}: imitation learns from a recording and has no use for that."
         )
-    if config.recording is None:
+    if not config.recording:
         raise TerrellaError("say which recording is imitated: --from RECORDING.")
     outside = None
     if config.real is not None:

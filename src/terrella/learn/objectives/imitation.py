@@ -1,6 +1,8 @@
 """Behaviour cloning of chunks of actions (ACT, Zhao et al. 2023): cross-entropy for choices and buttons, flow matching for axes."""
 
-from collections.abc import Iterator, Mapping
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
@@ -36,6 +38,21 @@ class Demonstrations:
     waypoints: tuple[Mapping[str, torch.Tensor], ...] = ()
     """Numbers [N, ...] some steps after the instruction of the moment began, and at its end."""
     begins: torch.Tensor | None = None  # float32 [N]: 1 where an instruction begins at the moment
+
+    @staticmethod
+    def joined(parts: Sequence[Demonstrations]) -> Demonstrations:
+        """The moments of several, one after another; not for windows or outcomes."""
+
+        def cat(name: str) -> torch.Tensor | None:
+            values = [getattr(part, name) for part in parts]
+            return None if values[0] is None else torch.cat(values)
+
+        def seen(each: Sequence[Mapping[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+            return {name: torch.cat([one[name] for one in each]) for name in each[0]}
+
+        alike = {name: cat(name) for name in ("acted", "chunk", "weight", "words", "begins")}
+        waypoints = tuple(seen(each) for each in zip(*(part.waypoints for part in parts)))
+        return Demonstrations(seen=seen([part.seen for part in parts]), waypoints=waypoints, **alike)  # pyright: ignore[reportArgumentType]
 
 
 class BehaviourCloning:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +13,18 @@ import torch
 
 from ...act.actor import RUN_SUBFOLDER
 from ...act.actor_network import ActorConfig
+from ...act.embodiment import Embodiment
 from ...act.imitation import ImitationActor
 from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork, is_picture
 from ...act.sentences import vocabulary_of
 from ...core.errors import DatasetError, TrainingError
 from ...core.similar import did_you_mean
-from ...core.spec import Spec, kind_of
+from ...core.spec import CHOICE, Spec, kind_of
 from ...data import Dataset
 from ...data.channels import ESTIMATES, PRIVILEGED, usually_seen
 from ...data.training.cache import array_for
 from ..copycat import copycat
-from ..demonstrations import DemonstrationRows
+from ..demonstrations import DemonstrationRows, JointDemonstrations
 from ..devices import device_named
 from ..feeds import RandomBatches
 from ..objectives.imitation import BehaviourCloning
@@ -70,7 +71,7 @@ class Imitation:
 
 
 def train_imitation(
-    recording: str | Path,
+    recording: str | Path | Sequence[str | Path],
     out: str | Path,
     practice: Practice,
     imitation: Imitation,
@@ -81,27 +82,32 @@ def train_imitation(
 ) -> dict[str, Any]:
     """Trains, or resumes, a policy in `out`/policy that acts as the recording's player did. Returns the facts of the run, with the
     verdict on held-out episodes. relabel: which rows are learned from, with what actions; default: a recorded teacher's (channel
-    `expert`), else those that were taken. spec: where it is to act. DatasetError or TrainingError for what cannot be imitated,
-    ActionError or ChannelError if it could not act there."""
+    `expert`), else those that were taken. spec: where it is to act. recording: or several, of one body or of several, which the
+    policy tells apart by their embodiments. DatasetError or TrainingError for what cannot be imitated, ActionError or ChannelError
+    if it could not act there."""
     out, batch, place = Path(out), practice.batch or 256, device_named(device)
     _check(practice, imitation)
-    opened, sees = open_demonstrations(recording, practice.sees, imitation.picture_size, report)
-    config = config_of(opened, sees, practice.hidden, imitation)
+    names = [recording] if isinstance(recording, str | Path) else recording
+    several = [open_demonstrations(name, practice.sees, imitation.picture_size, report) for name in names]
+    sees, config = several[0][1], joint_config(several, practice.hidden, imitation)
+    recording = ", ".join(map(str, names))
     if spec is not None:
         config.check(spec)
-    settings = {**asdict(imitation), "recording": str(recording)}
+    settings = {**asdict(imitation), "recording": recording}
     run = Run.of(out, practice, report, place, ("minutes",), **settings)
     run.saved_facts(STAGE)
     torch.manual_seed(practice.seed)
     network = ImitationNetwork(config).to(run.device)
-    rows = relabel(DemonstrationRows.of(opened, config, run.device))
+    parts = tuple(relabel(DemonstrationRows.of(opened, config, run.device)) for opened, _ in several)
+    rows = JointDemonstrations(parts)
     network.fit_normalization(rows.sample(4096, np.random.default_rng(0)).seen)
     objective = BehaviourCloning(network, practice.learning_rate)
     feed = SizedFeed(lambda size: RandomBatches(lambda now: rows.sample(size, now.rng)), batch)
     trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
     trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
-    whom = f"the teacher (channel 'expert') in {recording}" if rows.taken is not None else str(recording)
-    card = {"what": f"A policy that imitates {whom}", "learned_from": str(recording), "sees": list(sees)}
+    whom = f"the teacher (channel 'expert') in {recording}" if parts[0].taken is not None else recording
+    card = {"what": f"A policy that imitates {whom}", "learned_from": recording, "sees": list(sees)}
+    card |= {"bodies": [body.name for body in config.bodies]} if config.bodies else {}
 
     def save() -> None:
         ImitationActor.write(network, out / RUN_SUBFOLDER, card)
@@ -110,8 +116,12 @@ def train_imitation(
         trainer.train(save)
     finally:
         save()
-    tested = copycat(network.eval(), rows.held_out, TESTED)
-    return {**trainer.summary, **card, **tested, "policy": str(out / RUN_SUBFOLDER)}
+    tested = [copycat(network.eval(), part.held_out, TESTED) for part in parts]
+    if len(parts) > 1:
+        verdicts = [f"{name}: {test['held_out_verdict']}" for name, test in zip(names, tested)]
+        shares = {str(name): test.get("held_out") for name, test in zip(names, tested)}
+        tested = [{"held_out": shares, "held_out_verdict": "\n".join(verdicts)}]
+    return {**trainer.summary, **card, **tested[0], "policy": str(out / RUN_SUBFOLDER)}
 
 
 def open_demonstrations(
@@ -143,8 +153,72 @@ def open_demonstrations(
     return opened.having(name for name in sees), tuple(sees)
 
 
-def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: Imitation) -> ImitationConfig:
-    """The network's shape, by the recording's channels, actions and instructions."""
+def joint_config(
+    several: Sequence[tuple[Recording, tuple[str, ...]]], hidden: int, imitation: Imitation
+) -> ImitationConfig:
+    """The network's shape by several recordings and what is seen of each. DatasetError where these differ, where actions of one
+    body do, or where bodies have actions of different kinds; TrainingError for settings that take one recording."""
+    first, sees = several[0]
+    instructed = any(len(set(opened.cache.tasks)) > 1 for opened, _ in several)  # one text is a recording's default
+    tasks = [task for opened, _ in several for task in opened.cache.tasks] if instructed else []
+    configs = [config_of(opened, sees, hidden, imitation, tasks) for opened, sees in several]
+    if len(several) == 1 and not _merges_bodies(first):
+        return configs[0]
+    if imitation.remember or imitation.outcome:
+        raise TrainingError("--remember and --outcome take one recording.")
+    bodies: dict[str, Embodiment] = {}
+    for (opened, _), config in zip(several, configs):
+        body, actor = embodiment_of(opened), config.actor
+        unlike = {name for name, _ in {*actor.sees} ^ {*configs[0].actor.sees}}
+        if unlike:
+            alike = [name for name, shape in actor.sees if (name, shape) in configs[0].actor.sees]
+            raise DatasetError(
+                f"{first.name} and {opened.name} differ in {', '.join(sorted(unlike))}: "
+                + (f"name what they have alike, --sees {' '.join(alike)}." if alike else "one policy cannot see both.")
+            )
+        if unlike := bodies.setdefault(body.name, body).differs(body):
+            raise DatasetError(f"{opened.name} has other actions of {body.name} than the others: {unlike}.")
+        if actor.mode != configs[0].actor.mode or (actor.mode == CHOICE and actor.counts != configs[0].actor.counts):
+            raise DatasetError(
+                f"the actions of {first.name} and {opened.name} are of different kinds: train a policy for each."
+            )
+    widest = max(configs, key=lambda config: config.action_width)
+    return replace(widest, bodies=tuple(bodies.values()) if len(bodies) > 1 else ())
+
+
+def _merges_bodies(opened: Recording) -> list[dict[str, Any]]:
+    """What a recording that `data merge` made of several bodies says of each; [] for others."""
+    merged = (opened.dataset.about.get("embodiments") if opened.dataset else None) or []
+    return merged if len(merged) > 1 else []
+
+
+def embodiment_of(opened: Recording) -> Embodiment:
+    """The body whose actions a recording holds. DatasetError where it does not say which, or merges several."""
+    controls = opened.controls
+    assert controls is not None and opened.dataset is not None
+    world = opened.dataset.world
+    if merged := _merges_bodies(opened):
+        names, sources = [one["name"] for one in merged], [path for one in merged for path in one.get("sources", ())]
+        raise DatasetError(
+            f"{opened.name} merges {' and '.join(names)}, whose actions have no space of their own there: name their recordings, "
+            f"--from {' '.join(sources)}."
+        )
+    if not opened.embodiment:
+        raise DatasetError(f"{opened.name} does not say of which body its actions are (robot_type in meta/info.json).")
+    shape = tuple(world.get("action_shape") or (len(controls.low),))
+    names, units = (tuple(world.get(f"action_{key}") or ()) for key in ("names", "units"))
+    mode, frame = (str(world.get(f"action_{key}") or "") for key in ("mode", "frame"))
+    return Embodiment(opened.embodiment, shape, controls.low, controls.high, names, units, mode, frame)
+
+
+def config_of(
+    opened: Recording,
+    sees: tuple[str, ...],
+    hidden: int,
+    imitation: Imitation,
+    tasks: Sequence[str] | None = None,
+) -> ImitationConfig:
+    """The network's shape, by the recording's channels, actions and instructions, or these `tasks`."""
     controls = opened.controls
     assert controls is not None
     mode, action_shape = controls.kind, opened.cache.world.get("action_shape")
@@ -155,7 +229,8 @@ def config_of(opened: Recording, sees: tuple[str, ...], hidden: int, imitation: 
     execute = imitation.execute or max(1, chunk // 2)
     if execute > chunk:
         raise TrainingError(f"--execute {execute}: at most the {chunk} actions of --chunk can be taken.")
-    tasks = opened.cache.tasks if len(set(opened.cache.tasks)) > 1 else ()
+    tasks = opened.cache.tasks if tasks is None else tasks
+    tasks = tasks if len(set(tasks)) > 1 else ()
     pictures, numbers = (any(kind(shape) for _, shape in seen) for kind in (is_picture, lambda shape: len(shape) < 2))
     foresees = pictures and numbers and tasks and not imitation.remember
     return ImitationConfig(
