@@ -68,7 +68,7 @@ def test_it_learns_the_other_body_and_forgets_less_where_it_rehearses(made, tmp_
 
 def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
     world, old, new = made
-    with pytest.raises(TrainingError, match="doom-maze is a world with depth and poses"):
+    with pytest.raises(DatasetError, match="are not those of doom-maze"):
         adapt(terrella.load("doom-maze"), new, tmp_path / "run", SHORT, quiet)
     for wrong in (AdaptConfig(minutes=0), AdaptConfig(batch=0), AdaptConfig(batch=-2), AdaptConfig(learning_rate=-1.0)):
         with pytest.raises(TrainingError, match="--minutes and --learning-rate are more than 0"):
@@ -133,4 +133,4 @@ def test_the_command_says_what_was_gained_and_what_was_forgotten(made, tmp_path,
     assert f"next: terrella train policy --out {out}-policy --in {out}" in said  # without pictures it cannot be played
     assert said.startswith("After 16 steps its error on the new recording is") and "On the old one it is" in said
     assert main(["adapt", "doom-maze", "--from", str(new), "--out", out]) == 2
-    assert "is a world with depth and poses" in capsys.readouterr().err
+    assert "are not those of doom-maze" in capsys.readouterr().err

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import re
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,9 +12,11 @@ from terrella.core import make_rng, rollout
 from terrella.core.errors import DatasetError, TerrellaError
 from terrella.core.policy import Idle
 from terrella.data import record
+from terrella.measure.page_parts import COLOURS
 from terrella.measure.physics import examine_physics, physics_verdict
-from terrella.measure.physics_film import film_of_bodies
+from terrella.measure.physics_film import film_of_bodies, framed
 from terrella.measure.physics_page import physics_page
+from terrella.measure.plot import Line, line_chart
 from terrella.physics import PhysicalSystem, trajectory_of
 from terrella.physics.laws.non_penetration import begins_inside
 from terrella.sim.bodies import BodiesConfig, BodiesWorld
@@ -64,6 +68,11 @@ def test_half_the_gravity_is_seen_and_measured():
     assert report.coarse_horizon.value == 0
     assert any("free fall: broken in 100%" in line for line in physics_verdict(report))
     assert "free fall" in physics_page("half", report)
+    worst = report.worst
+    assert worst is not None and worst.law == "free fall" and max(worst.by_step) > worst.tolerance
+    assert "breaks free fall by most, by 4.9 m/s2 in step" in physics_page("half", report)
+    same = physics_page("truth", examine_physics("truth", known, truth, truth))
+    assert "No rollout visibly breaks a law. Shown: the one that comes nearest" in same
 
 
 def test_a_frozen_world_is_seen_by_how_far_its_bodies_go():
@@ -80,6 +89,20 @@ def test_films_show_the_body_where_it_is():
     frames = film_of_bodies(trajectory_of(system, seen, dt_s))
     assert frames.shape == (25, 220, 220, 3)
     assert len({frame.tobytes() for frame in frames}) > 20
+
+
+def test_frames_that_break_the_law_are_red_at_the_edge():
+    frames = np.zeros((3, 20, 20, 3), np.uint8)
+    marked = framed(frames, [False, True, False])
+    assert marked[1, 0, 0].tolist() == [214, 69, 69] and not marked[1, 10, 10].any() and not marked[[0, 2]].any()
+
+
+def test_labels_of_small_values_are_not_cut():
+    x, y = [1.0, 2.0, 3.0], [1e-4, 2e-4, 3e-4]
+    line = Line("a", x, y, y, y, COLOURS[0])
+    svg = line_chart([line], [], "steps", "m", y_range=(0.0, 6e-4))
+    ends = [float(at) for at in re.findall(r'<text x="([0-9.]+)" y="[0-9.]+" text-anchor="end">0.0006', svg)]
+    assert ends and ends[0] >= 7 * len("0.0006")
 
 
 def test_bodies_that_begin_inside_each_other_are_named(recording, tmp_path):

@@ -84,7 +84,8 @@ def adapt(
     same command continues.
 
     Args:
-        name: A latent world, or one of frames alone: a run of `train latent` or `train video`, or its folder.
+        name: A learned world: a run of `train latent` or `train video`, or its folder. One with depth and poses has the places
+            of the new recording from then on.
         data: A recording of the other body or camera, with the same channels and as many actions.
         out: Folder of the run; the adapted world is in OUT/world.
         keep: A recording that the world was trained on. Half of the clips are of it (of frames a quarter), so that less

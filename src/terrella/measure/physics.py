@@ -50,11 +50,13 @@ class ConstantReport:
 
 @dataclass(frozen=True)
 class WorstRollout:
-    """The rollout that breaks a law by most, beside the truth."""
+    """The rollout that breaks a law by most, or comes nearest to it, beside the truth."""
 
     law: str
-    step: int
-    violation: float  # in tolerances
+    unit: str
+    step: int  # of the largest violation, from 1
+    by_step: tuple[float, ...]  # its violation of that law, in the unit
+    tolerance: float  # the coarse one, in the unit
     truth: Trajectory  # of one rollout
     dream: Trajectory
 
@@ -114,7 +116,7 @@ def examine_physics(
     horizon, wide_horizon = (median_interval(one.horizon.double(), rng) for one in (strict, loose))
     return PhysicsReport(
         name, dream.batch, dream.steps, dream.dt_s, laws, missing, constants, spread, deviation, horizon, wide_horizon, change,
-        _worst(loose, truth, dream), _begun_inside(tolerances, known, truth),
+        _worst(loose, relaxed, truth, dream), _begun_inside(tolerances, known, truth),
     )  # fmt: skip
 
 
@@ -146,14 +148,17 @@ def _constant(values: torch.Tensor, rng: torch.Generator) -> Figure:
     return mean_interval(known, rng) if len(known) else Figure(math.nan, math.nan, math.nan, 0)
 
 
-def _worst(certificates: Certificates, truth: Trajectory, dream: Trajectory) -> WorstRollout | None:
-    """The rollout and the law with the largest violation; None where no law says anything."""
+def _worst(
+    certificates: Certificates, tolerances: Sequence[Tolerance], truth: Trajectory, dream: Trajectory
+) -> WorstRollout | None:
+    """The rollout and the law with the largest violation, in tolerances; None where no law says anything."""
     if not certificates.laws:
         return None
-    row, law = divmod(int(certificates.worst.argmax()), len(certificates.laws))
-    pick = torch.tensor([row])
-    step, violation = int(certificates.step[row, law]), float(certificates.worst[row, law])
-    return WorstRollout(certificates.laws[law], step, violation, truth.at(pick), dream.at(pick))
+    row, number = divmod(int(certificates.worst.argmax()), len(certificates.laws))
+    pick, name = torch.tensor([row]), certificates.laws[number]
+    one = next(one for one in tolerances if one.law.name == name)
+    residual, step = one.law.residual(dream)[:, row], int(certificates.step[row, number])
+    return WorstRollout(name, one.law.unit, step, tuple(residual.tolist()), one.value, truth.at(pick), dream.at(pick))
 
 
 def physics_verdict(report: PhysicsReport) -> list[str]:
@@ -167,8 +172,8 @@ def physics_verdict(report: PhysicsReport) -> list[str]:
     ]
     for one in sorted(broken, key=lambda one: -one.broken_coarsely.value)[:3]:
         lines.append(
-            f"{one.name}: broken in {one.broken_coarsely.value:.0%} of rollouts by more than {one.coarse:.2g} {one.unit} (by "
-            f"{one.violation.value:.2g} on average; the truth by {one.tolerance:.2g} at most)."
+            f"{one.name}: broken in {one.broken_coarsely.value:.0%} of rollouts by more than {in_words(one.coarse)} {one.unit} (by "
+            f"{in_words(one.violation.value)} on average; the truth by {one.tolerance:.2g} at most)."
         )
     for one in report.constants:
         unit = f" {one.unit}" if one.unit else ""
@@ -183,6 +188,11 @@ def physics_verdict(report: PhysicsReport) -> list[str]:
         lines.append(f"bodies go {report.change.value:.2f} times as far as in the truth (0 would be frozen).")
     lines += [f"{one.name}: {one.wrong_here}." for one in report.laws if one.wrong_here]
     return [*lines, *report.notes]
+
+
+def in_words(value: float) -> str:
+    """Two digits, and large numbers in full."""
+    return f"{value:.2g}" if abs(value) < 99.5 or not math.isfinite(value) else f"{value:,.0f}"
 
 
 def _times(ratio: float) -> str:
@@ -200,7 +210,7 @@ def table_of_laws(report: PhysicsReport) -> tuple[list[str], list[list[str]]]:
     heads = ["law", "unit", "tolerance", "violation", "broken", "broken coarsely", "false alarms", "injected, detected"]
     rows = [
         [
-            one.name, one.unit, f"{one.tolerance:.2g}", f"{one.violation.value:.2g}", _share(one.broken),
+            one.name, one.unit, f"{one.tolerance:.2g}", in_words(one.violation.value), _share(one.broken),
             _share(one.broken_coarsely), _share(one.false_alarms), _share(one.detected),
         ]
         for one in report.laws

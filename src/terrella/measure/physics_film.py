@@ -1,5 +1,7 @@
 """Films of bodies and walls, drawn from motion alone, for any world whose bodies are known."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
@@ -11,6 +13,7 @@ SIZE = 220  # pixels
 _BACK, _WALL, _EDGE = (16, 20, 27), (70, 78, 92), (13, 15, 19)
 _COLOURS = ((111, 211, 193), (227, 168, 87), (142, 166, 255), (224, 122, 155), (182, 211, 111))
 _DRIVEN = (139, 147, 163)
+_RED, _FRAME = (214, 69, 69), 4  # pixels
 _CORNERS = torch.tensor([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]).double()
 
 
@@ -36,6 +39,16 @@ def film_of_bodies(motion: Trajectory, like: Trajectory | None = None) -> np.nda
                 _draw_body(draw, motion, instant, body, at, scale)
         frames.append(np.asarray(canvas))
     return np.stack(frames)
+
+
+def framed(frames: np.ndarray, marked: Sequence[bool]) -> np.ndarray:
+    """Frames uint8 [T, H, W, 3], those that are marked with a red frame."""
+    frames = frames.copy()
+    for at in np.flatnonzero(marked):
+        inner = frames[at, _FRAME:-_FRAME, _FRAME:-_FRAME].copy()
+        frames[at] = _RED
+        frames[at, _FRAME:-_FRAME, _FRAME:-_FRAME] = inner
+    return frames
 
 
 def _plane(motion: Trajectory) -> tuple[int, int]:

@@ -6,8 +6,8 @@ from html import escape
 
 from ..physics.laws.energy import energy
 from .page_parts import COLOURS, QUIET, document, legend, section, table_of
-from .physics import LawReport, PhysicsReport, physics_verdict, table_of_laws
-from .physics_film import film_of_bodies
+from .physics import LawReport, PhysicsReport, WorstRollout, in_words, physics_verdict, table_of_laws
+from .physics_film import film_of_bodies, framed
 from .plot import Line, line_chart
 from .plot_points import dot_plot
 from .strip import film
@@ -52,15 +52,33 @@ def _hero(report: PhysicsReport, lines: list[str]) -> str:
     shown = ""
     if report.worst is not None:
         worst = report.worst
-        frames = [film_of_bodies(worst.truth), film_of_bodies(worst.dream, worst.truth)]
+        broken = [False, *(not value <= worst.tolerance for value in worst.by_step)]
+        frames = [film_of_bodies(worst.truth), framed(film_of_bodies(worst.dream, worst.truth), broken)]
         data = base64.b64encode(film(frames, max(report.dt_s, 0.05))).decode()
         height, width = frames[0].shape[1:3]
         shown = (
             f'<figure class=film style="aspect-ratio:{width}/{2 * height + 4}"><img alt="The truth above, the world below" '
             f'src="data:image/webp;base64,{data}"><figcaption><span>truth</span><span>dream</span></figcaption></figure>'
         )
-        rest += f"<li>Shown: the rollout that breaks {escape(worst.law)} by most, in step {worst.step}.</li>"
+        rest += f"<li>{escape(_shown(worst))}</li></ul>{_violation_of(worst)}<ul>"
     return f"<section class=hero>{shown}<div class=good><h2>{escape(lines[0])}</h2><ul>{rest}</ul></div></section>"
+
+
+def _shown(worst: WorstRollout) -> str:
+    largest = worst.by_step[worst.step - 1]
+    most = f"{in_words(largest)} {worst.unit} in step {worst.step}, where {in_words(worst.tolerance)} would be seen"
+    if not largest <= worst.tolerance:
+        return f"Shown: the rollout that breaks {worst.law} by most, by {most}. Its frames are red while it breaks it."
+    return f"No rollout visibly breaks a law. Shown: the one that comes nearest to it, {worst.law} by {most}."
+
+
+def _violation_of(worst: WorstRollout) -> str:
+    """The violation of the law that the film shows, by step."""
+    x, y = [float(step) for step in range(1, len(worst.by_step) + 1)], list(worst.by_step)
+    line = Line(worst.law, x, y, y, y, COLOURS[0], mark=float(worst.step))
+    top = 1.05 * max([value for value in y if math.isfinite(value)] + [1.2 * worst.tolerance])
+    svg = line_chart([line], _ticks(len(x)), "steps", worst.unit, False, (0.0, top), [worst.tolerance])
+    return f"<div class=charts><figure><h3>{escape(worst.law)} in this rollout</h3>{svg}</figure></div>"
 
 
 def _ticks(steps: int) -> list[tuple[float, str]]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from html import escape
 
 _WIDTH, _HEIGHT, _RIGHT = 380, 250, 12
-_LEFT, _TOP, _BOTTOM = 40, 14, 40
+_LEFT, _TOP, _BOTTOM = 40, 14, 40  # left: at least
 
 
 @dataclass(frozen=True)
@@ -38,24 +38,26 @@ def line_chart(
     xs = [warp(x) for line in lines for x in line.x]
     bottom, top = y_range or y_span([v for line in lines for v in (*line.y, *line.low, *line.high)] + list(guides))
     left, right = min(xs), max(max(xs), min(xs) + 1e-9)
+    ticks = [(value, f"{value:g}") for value in round_ticks(bottom, top)]
+    start = max([_LEFT, *(10 + 7 * len(label) for _, label in ticks)])
 
     def at(x: float, y: float) -> tuple[float, float]:
-        across = _LEFT + (warp(x) - left) / (right - left) * (width - _LEFT - margin)
+        across = start + (warp(x) - left) / (right - left) * (width - start - margin)
         share = (min(max(y, bottom), top) - bottom) / (top - bottom)
         return round(across, 1), round(height - _BOTTOM - share * (height - _TOP - _BOTTOM), 1)
 
     about = f"{escape(y_label)} against {escape(x_label)}"
     parts = [f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{about}">']
-    for value in round_ticks(bottom, top):
+    for value, label in ticks:
         y = at(lines[0].x[0], value)[1]
-        parts.append(f'<path class="grid" d="M{_LEFT} {y}H{width - margin}"/>')
-        parts.append(f'<text x="{_LEFT - 6}" y="{y + 4}" text-anchor="end">{value:g}</text>')
+        parts.append(f'<path class="grid" d="M{start} {y}H{width - margin}"/>')
+        parts.append(f'<text x="{start - 6}" y="{y + 4}" text-anchor="end">{label}</text>')
     for value, label in x_ticks:
         x = at(value, bottom)[0]
         parts.append(f'<path class="grid" d="M{x} {height - _BOTTOM}v4"/>')
         parts.append(f'<text x="{x}" y="{height - _BOTTOM + 17}" text-anchor="middle">{escape(label)}</text>')
     ys = [at(lines[0].x[0], value)[1] for value in guides]
-    parts += [f'<path class="guide" d="M{_LEFT} {y}H{width - margin}"/>' for y in ys]
+    parts += [f'<path class="guide" d="M{start} {y}H{width - margin}"/>' for y in ys]
     parts += [_band_path(line, at) for line in lines]
     for line in lines:
         points = [at(x, y) for x, y in zip(line.x, line.y) if math.isfinite(y)]
@@ -65,9 +67,9 @@ def line_chart(
         if line.mark is not None and line.mark in line.x:
             x, y = at(line.mark, line.y[line.x.index(line.mark)])
             parts.append(f'<circle class="mark" cx="{x}" cy="{y}" r="4.5" stroke="{line.colour}">{name}</circle>')
-    middle = (_LEFT + width - margin) / 2
+    middle = (start + width - margin) / 2
     parts.append(f'<text x="{middle}" y="{height - 5}" text-anchor="middle">{escape(x_label)}</text>')
-    parts.append(f'<text x="{_LEFT + 4}" y="{_TOP - 3}">{escape(y_label)}</text></svg>')
+    parts.append(f'<text x="{start + 4}" y="{_TOP - 3}">{escape(y_label)}</text></svg>')
     return "".join(parts)
 
 

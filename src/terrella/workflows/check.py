@@ -112,6 +112,11 @@ def check(world: str, config: CheckConfig, *, progress: Progress = silent) -> Ch
         raise DatasetError(f"{config.data} has one episode, and a check needs two or more; record more.")
     length = config.steps + (EDGE if pictures else 0)
     clips = clips_from_cache(cache, chosen, CONTEXT, length, config.rollouts, rng, advice=ADVICE)
+    if len(clips) < config.rollouts and not config.fresh:
+        progress(
+            f"{len(clips)} rollouts, not {config.rollouts}: the episodes held out of training give no more. Another recording, "
+            "which training never used, gives more with --fresh."
+        )
     apart = [number for number in every if number not in chosen] or every
     most = _most_known(opened.spec, length) if pictures else KNOWN
     known = clips_from_cache(cache, apart, CONTEXT, length, most, rng, advice=ADVICE)

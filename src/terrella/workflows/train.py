@@ -58,7 +58,7 @@ def adapt(
     keep: str | Path | None = None,
     progress: Progress = silent,
 ) -> TrainResult:
-    """Adapts the world named `world`, a latent one or one of frames alone, to the body or camera of the recording `data`. keep: a
+    """Adapts the world named `world`, a learned one, to the body or camera of the recording `data`. keep: a
     recording that it was trained on, of which half of each batch is made. The facts have the open-loop errors before and after;
     the run is in `out`."""
     settings, opened = config or AdaptConfig(), load_named(world, "cpu")

@@ -17,7 +17,7 @@ from ..trainer import Report
 from .adapt_frames import adapt_frames, settings_of
 from .latent import Beginning, LatentTraining, open_rows, train_latent, vectors_of
 
-LATENT_RATE, FRAMES_RATE = 5e-4, 3e-3  # peak learning rates
+LATENT_RATE, FRAMES_RATE, PLACES_RATE = 5e-4, 3e-3, 4e-4  # peak learning rates
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class AdaptConfig:
     # Training steps. Training ends after these or after --minutes, whichever comes first. Default: 4000, with pictures 2500, of a
     # world that draws frames 8000, on a GPU 60000.
     steps: int | None = None
-    # Peak learning rate. Default: 5e-4, of a world that draws frames 3e-3.
+    # Peak learning rate. Default: 5e-4, of a world of frames alone 3e-3, with depth and poses 4e-4.
     learning_rate: float | None = None
     # Clips per step, those of --keep included. Default: 128, with pictures 32, of frames 8, on a GPU 64.
     batch: int | None = None
@@ -41,18 +41,19 @@ class AdaptConfig:
 def adapt(
     world: World, data: str | Path, out: str | Path, config: AdaptConfig, report: Report, keep: str | Path | None = None
 ) -> dict:
-    """Trains, or resumes, a copy of a latent world, or of a world of frames alone, on the recording `data`; `out`/world is the
-    result. keep: a recording of what it learned before, of which half of the clips are, of frames a quarter. Returns facts, the
-    verdict first; `errors` has, of each recording, the world's open-loop error on held-out episodes by step, before and after, as a
-    share of copy-last's: of latents, or the squared error of frames. TrainingError for a world that cannot go on learning;
-    DatasetError for a recording with other channels or actions."""
+    """Trains, or resumes, a copy of a learned world on the recording `data`; `out`/world is the result. A world with depth and
+    poses has the places of `data` from then on. keep: a recording of what it learned before, of which half of the clips are, of
+    frames a quarter. Returns facts, the verdict first; `errors` has, of each recording, the world's open-loop error on held-out
+    episodes by step, before and after, as a share of copy-last's: of latents, or the squared error of frames. TrainingError for a
+    world that cannot go on learning; DatasetError for a recording with other channels or actions."""
     rate, counts = config.learning_rate, [one for one in (config.steps, config.batch) if one is not None]
     if config.minutes <= 0 or min(counts, default=1) < 1 or (rate is not None and rate <= 0):
         raise TrainingError("--minutes and --learning-rate are more than 0, and --steps and --batch 1 or more.")
     if isinstance(world, LearnedWorld):
+        settings, usual = settings_of(world), PLACES_RATE if world.config.geometry else FRAMES_RATE
         settings = replace(
-            settings_of(world), hours=config.minutes / 60, steps=config.steps, batch=config.batch, seed=config.seed,
-            learning_rate=config.learning_rate or FRAMES_RATE, device=config.device,
+            settings, hours=config.minutes / 60, steps=config.steps, batch=config.batch, seed=config.seed,
+            learning_rate=config.learning_rate or usual, device=config.device,
         )  # fmt: skip
         facts, errors = adapt_frames(world, data, out, settings, report, keep)
         return {**facts, "latent": False, "verdict": verdict(errors), "errors": errors}

@@ -1,7 +1,8 @@
-"""adapt of worlds of frames alone: the network that draws goes on learning on the frames of another camera or body."""
+"""adapt of worlds of frames, with or without places: the network that draws goes on learning on those of another camera or body."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +10,20 @@ import torch
 
 from ...core.errors import DatasetError, TrainingError
 from ...core.world import make_rng
+from ...worlds.body import MotionBody
 from ...worlds.folder import load_world
+from ...worlds.keyframe_scene import KeyframeScene
 from ...worlds.learned import LearnedWorld
 from ...worlds.parts import newest_frame
 from ...worlds.uncertainty import NoUncertainty
+from ..objectives.flow import CRITIC_AHEAD
 from ..paired import open_paired
-from ..recording import Recording
+from ..recording import Recording, open_views
 from ..trainer import Report
 from .video import train_video
 from .video_config import TrainConfig
 from .video_flat import FlowBeginning
+from .video_posed import PosedBeginning, places_of
 
 HORIZONS = 1, 8, 16  # steps after which errors are measured
 ROLLOUTS, AT_ONCE = 32, 8  # of held-out frames
@@ -32,34 +37,55 @@ def adapt_frames(
     report: Report,
     keep: str | Path | None,
 ) -> tuple[dict, dict]:
-    """Trains, or resumes, a copy of a world of frames alone on `data`, beside `keep`; returns the facts of the run, and the errors
-    of both recordings before and after, as `frame_errors`. Size, history and step count follow the world."""
-    if world.config.geometry or world.generator.kind != "flow":
-        raise TrainingError(
-            f"{world.spec.name} is a world with depth and poses, and these do not adapt; `terrella train dreams` continues its "
-            "training."
-        )
+    """Trains, or resumes, a copy of the world on `data`, beside `keep`; returns the facts of the run, and the errors of both
+    recordings before and after, as `frame_errors`. Size, history and step count follow the world. A world of places gets those of
+    `data`, and is measured on `data` with them before, too, and on `keep` with its own."""
+    places = isinstance(world.body, MotionBody) and isinstance(world.scene, KeyframeScene)
+    if not places and world.generator.kind != "flow":
+        raise TrainingError(f"{world.spec.name} does not adapt: it is no world that `terrella train video` makes now.")
     recordings = {name: _fitting(world, one, report) for name, one in (("new", data), ("old", keep)) if one is not None}
-    before = {name: frame_errors(world, one) for name, one in recordings.items()}
-    begin = FlowBeginning(world, recordings.get("old"))
+    kept = recordings.get("old")
+
+    def errors(**of: LearnedWorld) -> dict[str, dict[str, float]]:
+        return {name: frame_errors(of[name], recording) for name, recording in recordings.items()}
+
+    before = errors(new=_placed(world, recordings["new"]) if places else world, old=world)
+    begin = PosedBeginning(world, kept) if places else FlowBeginning(world, kept)
     facts = train_video(data, out, settings, report, begin=begin)
     adapted = load_world(facts["world"])
-    after = {name: frame_errors(adapted, one) for name, one in recordings.items()}
+    after = errors(new=adapted, old=adapted.replaced(scene=world.scene) if places else adapted)
     return facts, {name: {"before": before[name], "after": after[name]} for name in before}
+
+
+def _placed(world: LearnedWorld, recording: Recording) -> LearnedWorld:
+    """The world in the places of a recording, as its camera sees them."""
+    fx, fy, cx, cy = recording.cache.world["camera"]
+    memory, config = places_of(recording, (fx, fy, cx, cy), len(world.memory)), world.scene.config
+    scene = KeyframeScene(replace(config, camera=(fx, fy, cx, cy)), memory, open_views(memory, 32))
+    return world.replaced(scene=scene.to(world.device))
 
 
 def settings_of(world: LearnedWorld) -> TrainConfig:
     """Settings of `train video` that repeat what the world is made of."""
     shape, drawn = world.config, world.generator.config
     frames = 0 if isinstance(world.uncertainty, NoUncertainty) else TrainConfig.uncertainty_frames
-    return TrainConfig(
-        world.spec.name, shape.size, False, drawn.channels, frames=drawn.slots, flow_steps=drawn.steps,
+    settings = TrainConfig(
+        world.spec.name, shape.size, shape.geometry, drawn.channels, frames=drawn.slots, flow_steps=drawn.steps,
         uncertainty_frames=frames, compile=False,
+    )  # fmt: skip
+    if not shape.geometry:
+        return settings
+    return replace(
+        settings, moving=shape.moving, keyframes=max(1, len(world.memory)), critic_from=CRITIC_AHEAD,
+        objects_steps=TrainConfig.objects_steps if shape.objects else 0,
+        estimator_steps=TrainConfig.estimator_steps if world.estimator else 0,
     )  # fmt: skip
 
 
 def _fitting(world: LearnedWorld, data: str | Path, report: Report) -> Recording:
     recording = open_paired(world, data, None, report).recording
+    if world.config.geometry and not recording.posed:
+        raise DatasetError(f"{data} does not say its camera, which {world.spec.name} needs beside depth and poses.")
     fps, own = recording.cache.fps, 1 / world.spec.dt_s
     if abs(fps / own - 1) > 0.01:
         raise DatasetError(f"{data} has {fps:g} steps a second, and {world.spec.name} {own:g}; record it at that rate.")

@@ -19,7 +19,7 @@ from ...worlds.flow import FlowConfig, FlowNetwork, carry
 from ...worlds.frame_history import FrameHistory, StartClips
 from ...worlds.generator import channels_last
 from ...worlds.learned import LearnedWorld
-from ...worlds.outcome import ConstantConfig, FrameOutcome
+from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
 from ..device_clips import ROOM, DeviceClips, DeviceGrounds, bytes_of
 from ..devices import free_bytes
@@ -114,7 +114,7 @@ class FlowRecipe:
         """A new network for the recording, or a copy of the one that the training continues."""
         if self.begin is not None:
             generator = network_of(self.begin.world)
-            self.knows_outcome = self._continue_outcome(self.begin.world) and self.begin.teaching > 0
+            self.knows_outcome = self.parts.continue_outcome(self.begin.world) and self.begin.teaching > 0
             if self.begin.teaching:
                 generator = smaller(generator, widths, self.parts.config.flow_steps)
             return copy.deepcopy(generator).to(self.parts.run.device).train().requires_grad_(True)
@@ -128,14 +128,6 @@ class FlowRecipe:
         network = FlowNetwork(replace(settings, views=views) if mounted else settings)
         network.moves[:], network.over[:] = scrolling.moves, scrolling.over
         return network
-
-    def _continue_outcome(self, world: LearnedWorld) -> bool:
-        """The model of rewards and ends goes on from that of the world, where both predict the same; whether they do."""
-        mine, theirs = self.parts.outcome, world.parts.get("outcome")
-        if mine is None or not isinstance(theirs, FrameOutcome) or mine.config != theirs.config:
-            return False
-        mine.load_state_dict(theirs.state_dict())
-        return True
 
     def _on_device(self, free_bytes: float) -> tuple[DeviceClips | None, str]:
         """The recording on a GPU with as many bytes free, if there is room for it, and a sentence of that."""

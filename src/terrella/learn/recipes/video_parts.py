@@ -71,6 +71,14 @@ class VideoParts:
 
         return [Stage("outcome", 0.08, learn)]
 
+    def continue_outcome(self, world: LearnedWorld) -> bool:
+        """The model of rewards and ends goes on from that of the world, where both predict the same; whether they do."""
+        mine, theirs = self.outcome, world.outcome
+        if mine is None or not isinstance(theirs, FrameOutcome) or mine.config != theirs.config:
+            return False
+        mine.load_state_dict(theirs.state_dict())
+        return True
+
     def trained_outcome(self, constant: ConstantConfig) -> FrameOutcome | ConstantOutcome:
         """A copy of the outcome model on the CPU; without one, the constant."""
         return ConstantOutcome(constant) if self.outcome is None else copy.deepcopy(self.outcome).cpu().float()

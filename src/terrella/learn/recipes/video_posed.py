@@ -1,10 +1,16 @@
 """Worlds of places: recordings with depth and poses. Stages: motion, outcome, objects, estimator, then a U-Net over a Glimpse."""
 
+from __future__ import annotations
+
 import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
+from torch import nn
 
+from ...space.camera import Intrinsics
+from ...space.keyframes import Keyframes
 from ...worlds.body import Motion, MotionBody
 from ...worlds.config import VideoConfig
 from ...worlds.generator import UNet
@@ -13,7 +19,7 @@ from ...worlds.learned import LearnedWorld
 from ...worlds.objects import STARTS, Billboards, BillboardsConfig
 from ...worlds.outcome import ConstantConfig
 from ..budget import Stage
-from ..feeds import place_feed
+from ..feeds import RandomBatches, place_feed
 from ..objectives.estimator import learn_estimator
 from ..objectives.flow import Flow
 from ..objectives.motion import learn_motion
@@ -25,11 +31,34 @@ from ..trainer import Run, Trainer
 from .video_config import TrainConfig
 from .video_parts import VideoParts
 
+KEPT_EVERY = 4  # batches, of which one rehearses
+Part = TypeVar("Part", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class PosedBeginning:
+    """What a training continues: a finished world of places, and a recording of its places to rehearse, if there is one."""
+
+    world: LearnedWorld
+    kept: Recording | None = None
+
 
 class PosedRecipe:
-    """A generator over a memory of keyframes, a body that slides along walls and, where they were recorded, objects."""
+    """A generator over a memory of keyframes, a body that slides along walls and, where they were recorded, objects. begin: its
+    generator, motion and outcome go on from those of a world; its places are those of the recording."""
 
-    def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig, plan: TrainingPlan):
+    def __init__(
+        self,
+        run: Run,
+        recording: Recording,
+        config: TrainConfig,
+        video: VideoConfig,
+        plan: TrainingPlan,
+        begin: PosedBeginning | None = None,
+    ):
+        self.begin = begin
+        if begin is not None:
+            video = replace(begin.world.config, camera=video.camera)
         self.plan, self.channels = replace(plan, compiled=False, lacking=""), video.channels
         if config.keep_out is not None:
             recording = replace(recording, usable=Recording.of(recording.cache, recording.seen, config.keep_out).usable)
@@ -37,16 +66,23 @@ class PosedRecipe:
         self.objects = Billboards(BillboardsConfig(video.actions, video.history)) if video.objects else None
         self.parts = VideoParts(run, recording, config, video)
         self.video = self.parts.video
-        rows = np.flatnonzero(recording.usable)
-        picks = choose_keyframes(np.asarray(recording.cache.pose), rows, config.keyframes)
-        self.memory = recording.sharp_keyframes(picks, self.video.camera)
+        self.memory = places_of(recording, self.video.camera, config.keyframes)
         critic, rate = (config.critic_from, config.critic_weight), config.learning_rate or 8e-4
-        self.objective = Flow(UNet(self.video.generator), config.flow_steps, rate, *critic)
-        self.motion = Motion(self.video.motion)
+        generator, self.motion = UNet(self.video.generator), Motion(self.video.motion)
+        if begin is not None:
+            body = begin.world.body
+            assert isinstance(body, MotionBody)
+            generator, self.motion = _learning(begin.world.generator), _learning(body.motion)
+            self.parts.continue_outcome(begin.world)
+        self.objective = Flow(generator, config.flow_steps, rate, *critic)
 
     def feed(self, batch: int) -> Feed:
         dream = self.objective.dream if self.video.steps == 1 else None  # a teacher sees recorded frames alone
-        return place_feed(self.parts.recording, self.memory, self.video, batch, dream)
+        feed, begin = place_feed(self.parts.recording, self.memory, self.video, batch, dream), self.begin
+        if begin is None or begin.kept is None:
+            return feed
+        kept = place_feed(begin.kept, begin.world.memory.to("cpu"), begin.world.config, batch, dream)
+        return RandomBatches(lambda now: (feed if now.step % KEPT_EVERY else kept).batch(now))
 
     def preparations(self) -> list[Stage]:
         stages = [Stage("motion", 0.08, self._learn_motion), *self.parts.outcome_stages()]
@@ -95,6 +131,17 @@ class PosedRecipe:
         recording = self.parts.recording
         first = np.intersect1d(recording.start, np.flatnonzero(recording.usable))
         return first[:: max(1, len(first) // STARTS)][:STARTS]
+
+
+def places_of(recording: Recording, camera: Intrinsics, count: int) -> Keyframes:
+    """Keyframes of the rows that may be trained on, spread over places and headings."""
+    picks = choose_keyframes(np.asarray(recording.cache.pose), np.flatnonzero(recording.usable), count)
+    return recording.sharp_keyframes(picks, camera)
+
+
+def _learning(part: Part) -> Part:
+    """A copy on the CPU that goes on learning."""
+    return copy.deepcopy(part).cpu().float().train().requires_grad_(True)
 
 
 def _terminal_reward(extra: np.ndarray, ends: np.ndarray) -> float:
