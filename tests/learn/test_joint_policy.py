@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from shutil import copytree, ignore_patterns
 
@@ -14,13 +15,20 @@ from gymnasium import spaces
 from tests.learn.stopping import quiet
 
 import terrella
-from terrella.act.embodiment import EMBODIMENT
+from terrella.act.embodiment import EMBODIMENT, Embodiment
 from terrella.cli import main
 from terrella.core.errors import ActionError, DatasetError, TrainingError
 from terrella.core.world import make_rng
-from terrella.data import Dataset, record
+from terrella.data import record
 from terrella.learn.demonstrations import DemonstrationRows
-from terrella.learn.recipes.imitation import Imitation, joint_config, open_demonstrations, train_imitation
+from terrella.learn.merged import by_body
+from terrella.learn.recipes.imitation import (
+    Imitation,
+    embodiment_of,
+    joint_config,
+    open_demonstrations,
+    train_imitation,
+)
 from terrella.learn.recipes.policy import Practice
 from terrella.sim.gymnasium import GymnasiumWorld
 
@@ -88,7 +96,7 @@ def test_one_policy_drives_bodies_of_other_actions(bodies):
     worlds, recordings, folder = bodies
     facts = train_imitation(list(recordings.values()), folder / "run", QUICK, Imitation(history=1, chunk=1), quiet)
     assert facts["bodies"] == [f"gym:Terrella{name}-v0" for name in BODIES]
-    assert all(f"{folder / name}: The policy" in facts["held_out_verdict"] for name in BODIES)
+    assert all(f"{folder / name} (gym:Terrella{name}-v0): The policy" in facts["held_out_verdict"] for name in BODIES)
     offset = torch.tensor([[-0.3], [0.3]])
     for name, world in worlds.items():
         policy, rng = terrella.load_policy(facts["policy"], world.spec), make_rng(0)
@@ -117,6 +125,27 @@ def test_a_batch_holds_every_recording_and_which_body_acted(bodies):
     assert joint_config([several[0], several[0]], 32, Imitation()).bodies == ()  # two recordings of one body
 
 
+def test_a_merged_recording_holds_each_bodys_own_actions(bodies, tmp_path, capsys):
+    worlds, recordings, _ = bodies
+    merge = ["data", "merge", *map(str, recordings.values()), "--out", f"{tmp_path}/all"]
+    assert not main(merge)
+    one, _ = open_demonstrations(tmp_path / "all", ("offset",), (64, 64), quiet)
+    for name, part in zip(BODIES, by_body(one), strict=True):
+        original, _ = open_demonstrations(recordings[name], ("offset",), (64, 64), quiet)
+        assert embodiment_of(part) == Embodiment.of(worlds[name].spec) == embodiment_of(original)
+        rows = part.usable | np.isin(part.start, [part.cache.ranges[number, 0] for number in part.held_out])
+        assert np.allclose(part.cache.action[rows], original.cache.action, atol=1e-6)
+    facts = train_imitation(tmp_path / "all", tmp_path / "run", replace(QUICK, steps=2), Imitation(history=1), quiet)
+    assert facts["bodies"] == [f"gym:Terrella{name}-v0" for name in BODIES]
+    text = (tmp_path / "all.toml").read_text()
+    cut = re.sub(r'\{name = "action_0", to = "[^"]*Wide[^}]*\}', '{name = "action_0", out = "not needed"}', text)
+    assert cut != text
+    (tmp_path / "cut.toml").write_text(cut)
+    assert not main([*merge[:-1], f"{tmp_path}/cut", "--mapping", f"{tmp_path}/cut.toml"])
+    with pytest.raises(DatasetError, match="does not hold the whole action of gym:TerrellaWide-v0: merge again"):
+        train_imitation(tmp_path / "cut", tmp_path / "other", QUICK, Imitation(), quiet)
+
+
 def test_recordings_that_one_policy_cannot_learn_from_are_refused(bodies, tmp_path, capsys):
     worlds, recordings, folder = bodies
     joint, imitation = [recordings["Forth"], recordings["Wide"]], Imitation(history=1)
@@ -130,18 +159,9 @@ def test_recordings_that_one_policy_cannot_learn_from_are_refused(bodies, tmp_pa
     (tmp_path / "other/meta/terrella.json").write_text(json.dumps(about))
     with pytest.raises(DatasetError, match="other has other actions of gym:TerrellaForth-v0 .* mode axes and torque"):
         train_imitation([recordings["Forth"], tmp_path / "other"], tmp_path / "run", QUICK, imitation, quiet)
-    assert not main(
-        ["data", "merge", *(str(recordings[name]) for name in ("Forth", "Back")), "--out", f"{tmp_path}/all"]
-    )
-    assert [one["name"] for one in Dataset(tmp_path / "all").about["embodiments"]] == [
-        "gym:TerrellaForth-v0", "gym:TerrellaBack-v0",
-    ]  # fmt: skip
     assert main(
         ["skills", "learn", str(recordings["Back"]), "--policy", f"{folder}/run", "--out", f"{tmp_path}/skills"]
     )
     assert "skills are learned from a policy of one body" in capsys.readouterr().err
-    trained = ["train", "policy", "--method", "imitation", "--out", f"{tmp_path}/run"]
-    assert main([*trained, "--from", f"{tmp_path}/all"])
-    assert f"name their recordings, --from {recordings['Forth']} {recordings['Back']}" in capsys.readouterr().err
     assert main(["train", "policy", "--in", "gym:Pendulum-v1", "--from", "a", "b", "--out", f"{tmp_path}/run"])
     assert "only imitation takes several" in capsys.readouterr().err

@@ -117,7 +117,8 @@ class Recording:
     @property
     def embodiment(self) -> str:
         """The body that its actions drove; "" where it is not known."""
-        return "" if self.dataset is None else self.dataset.embodiment
+        world = self.cache.world
+        return str(world.get("embodiment") or world.get("name") or (self.dataset.embodiment if self.dataset else ""))
 
     @property
     def seen(self) -> list[int]:

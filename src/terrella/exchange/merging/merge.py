@@ -67,6 +67,7 @@ def merge(
             robot: {
                 "sources": [it.path for it in mapping.sources if it.embodiment == robot],
                 "cameras": _views(mapping, sources, robot),
+                "actions": _actions(mapping, sources, robot),
             }
             for robot in mapping.embodiments
         }
@@ -372,6 +373,22 @@ def _views(mapping: MergeMapping, sources: Mapping[str, Source], robot: str) -> 
             if "calibration" in sensor.facts:
                 views[to].setdefault("calibration", sensor.facts["calibration"])
     return views
+
+
+def _actions(mapping: MergeMapping, sources: Mapping[str, Source], robot: str) -> dict[str, Any] | None:
+    """The robot's own actions: the facts of their space, and for each of their numbers which merged number it fills, with scale and
+    offset. None where a number is left out, or its recordings differ."""
+    places, declared = {name: place for place, name in enumerate(mapping.action)}, []
+    for source in mapping.sources:
+        if source.embodiment == robot:
+            origin, vector = sources[source.path], source.vectors.get(ACTION)
+            world: Any = origin.facts.get("world") or {}
+            if vector is None or any(number.out for number in vector.numbers):
+                return None
+            numbers = [(places[one.to], *affine(one, mapping.action[one.to])) for one in vector.numbers]
+            space = {key: value for key, value in world.items() if key.startswith("action_") or key == "discrete"}
+            declared.append({"space": {**space, "embodiment": origin.robot}, "numbers": numbers})
+    return declared[0] if declared and all(one == declared[0] for one in declared) else None
 
 
 def _left_out(source: SourceMapping, origin: Source) -> dict[str, str]:

@@ -1,7 +1,7 @@
 """Proposes the mapping of a merge, as far as names, units and frames allow; a person completes it."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,8 +63,9 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
     read as the unit; position_x and quat_w are x and qw; names in sensors other than "action" and "observation.state" get the
     sensor's name as prefix ("imu.ax"). Units are converted if both are stated, to the common unit or the quantity's basic one.
     Different stated frames or quantities give different dimensions. A number without a name gets its own dimension, such as
-    "aloha.state_3", shared by sources of one embodiment. Cameras of the same name become one, at their smallest size. Every
-    guess that should be checked is in its source's `notes`.
+    "aloha.state_3", shared by sources of one embodiment; a channel of such numbers that recordings of Terrella's worlds all have
+    alike ("observation.hand") is kept whole. Cameras of the same name become one, at their smallest size. Every guess that should
+    be checked is in its source's `notes`.
 
     fps: of the merged rows; None for the slowest source's.
     DatasetError without a source, or where no fps is known.
@@ -77,7 +78,8 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
     if fps is None and not known:
         raise DatasetError("none of the recordings states its fps; give the fps of the merged one.")
     notes: _Notes = {path: {} for path in sources}
-    places = [place for path in sources for place in _places(path, sources[path], names[path])]
+    alike = _alike(list(sources.values()))
+    places = [place for path in sources for place in _places(path, sources[path], names[path], alike)]
     filled: dict[_Place, str] = {}
     action = _share([place for place in places if place.sensor == ACTION], filled, notes)
     state = _share([place for place in places if place.sensor != ACTION], filled, notes)
@@ -90,7 +92,7 @@ def propose(sources: Mapping[str, Source], fps: float | None = None) -> MergeMap
             if place.source == path:
                 vectors.setdefault(place.sensor, []).append(Number(place.name, filled[place], place.unit))
         views = {name: name for name, it in source.sensors.items() if name in cameras and it.kind == cameras[name].kind}
-        keep, out = _rest(source, names[path] if several else "", cameras, {*vectors, *views})
+        keep, out = _rest(source, names[path] if several else "", cameras, {*vectors, *views}, alike)
         mapped.append(
             SourceMapping(
                 path=path,
@@ -149,11 +151,27 @@ def _short(sensor: str) -> str:
     return sensor.removeprefix("observation.")
 
 
-def _places(path: str, source: Source, embodiment: str) -> list[_Place]:
+def _alike(sources: Sequence[Source]) -> set[str]:
+    """Channels of numbers without names that recordings of worlds all have alike: the channel's name says what they are."""
+    if not all("world" in source.facts for source in sources):
+        return set()
+    forms = [
+        {
+            (name, sensor.shape, sensor.dtype, tuple(sensor.units.items()))
+            for name, sensor in source.sensors.items()
+            if sensor.kind == "vector" and name not in (ACTION, STATE) and _is_mapped(name, source)
+            if all(_stem(name, sensor, label)[0] is None for label in sensor.names or ("",))
+        }
+        for source in sources
+    ]
+    return {form[0] for form in set.intersection(*forms)}
+
+
+def _places(path: str, source: Source, embodiment: str, whole: Collection[str]) -> list[_Place]:
     places: list[_Place] = []
     for name, sensor in source.sensors.items():
         numbers = sensor.kind == "vector" and len(sensor.shape) == 1 and sensor.dtype != "string"
-        if not numbers or not _is_mapped(name, source):
+        if not numbers or not _is_mapped(name, source) or name in whole:
             continue
         if name not in (ACTION, STATE) and not sensor.names and sensor.shape[0] > _MAX_SPLIT:
             continue
@@ -295,7 +313,7 @@ def _cameras(sources: Mapping[str, Source], notes: _Notes) -> dict[str, MergedCa
 
 
 def _rest(
-    source: Source, embodiment: str, cameras: Mapping[str, MergedCamera], mapped: set[str]
+    source: Source, embodiment: str, cameras: Mapping[str, MergedCamera], mapped: set[str], alike: Collection[str]
 ) -> tuple[dict[str, str], dict[str, str]]:
     """(kept whole: sensor -> its merged name; left out: sensor -> why), for every sensor that is not in `mapped`."""
     keep: dict[str, str] = {}
@@ -307,7 +325,9 @@ def _rest(
         head, _, tail = _short(name).partition(".")
         embodiment = re.sub(r"[^\w.-]+", "_", embodiment)
         to = name
-        if embodiment and sensor.kind == "points":
+        if name in alike:
+            pass
+        elif embodiment and sensor.kind == "points":
             to = ".".join(["observation", head, embodiment, *([tail] if tail else [])])
         elif embodiment and not name.startswith(FOLLOWS):
             to = f"observation.{embodiment}.{_short(name)}"

@@ -27,6 +27,7 @@ from ..copycat import copycat
 from ..demonstrations import DemonstrationRows, JointDemonstrations
 from ..devices import device_named
 from ..feeds import RandomBatches
+from ..merged import by_body
 from ..objectives.imitation import BehaviourCloning
 from ..recording import Recording
 from ..sized_feed import SizedFeed
@@ -88,7 +89,8 @@ def train_imitation(
     out, batch, place = Path(out), practice.batch or 256, device_named(device)
     _check(practice, imitation)
     names = [recording] if isinstance(recording, str | Path) else recording
-    several = [open_demonstrations(name, practice.sees, imitation.picture_size, report) for name in names]
+    opened = [open_demonstrations(name, practice.sees, imitation.picture_size, report) for name in names]
+    several = [(part, sees) for one, sees in opened for part in by_body(one)]
     sees, config = several[0][1], joint_config(several, practice.hidden, imitation)
     recording = ", ".join(map(str, names))
     if spec is not None:
@@ -118,8 +120,9 @@ def train_imitation(
         save()
     tested = [copycat(network.eval(), part.held_out, TESTED) for part in parts]
     if len(parts) > 1:
+        names = [f"{part.recording.name} ({part.recording.embodiment})" for part in parts]
         verdicts = [f"{name}: {test['held_out_verdict']}" for name, test in zip(names, tested)]
-        shares = {str(name): test.get("held_out") for name, test in zip(names, tested)}
+        shares = {name: test.get("held_out") for name, test in zip(names, tested)}
         tested = [{"held_out": shares, "held_out_verdict": "\n".join(verdicts)}]
     return {**trainer.summary, **card, **tested[0], "policy": str(out / RUN_SUBFOLDER)}
 
@@ -162,7 +165,7 @@ def joint_config(
     instructed = any(len(set(opened.cache.tasks)) > 1 for opened, _ in several)  # one text is a recording's default
     tasks = [task for opened, _ in several for task in opened.cache.tasks] if instructed else []
     configs = [config_of(opened, sees, hidden, imitation, tasks) for opened, sees in several]
-    if len(several) == 1 and not _merges_bodies(first):
+    if len(several) == 1:
         return configs[0]
     if imitation.remember or imitation.outcome:
         raise TrainingError("--remember and --outcome take one recording.")
@@ -186,23 +189,11 @@ def joint_config(
     return replace(widest, bodies=tuple(bodies.values()) if len(bodies) > 1 else ())
 
 
-def _merges_bodies(opened: Recording) -> list[dict[str, Any]]:
-    """What a recording that `data merge` made of several bodies says of each; [] for others."""
-    merged = (opened.dataset.about.get("embodiments") if opened.dataset else None) or []
-    return merged if len(merged) > 1 else []
-
-
 def embodiment_of(opened: Recording) -> Embodiment:
-    """The body whose actions a recording holds. DatasetError where it does not say which, or merges several."""
+    """The body whose actions a recording holds. DatasetError where it does not say which."""
     controls = opened.controls
-    assert controls is not None and opened.dataset is not None
-    world = opened.dataset.world
-    if merged := _merges_bodies(opened):
-        names, sources = [one["name"] for one in merged], [path for one in merged for path in one.get("sources", ())]
-        raise DatasetError(
-            f"{opened.name} merges {' and '.join(names)}, whose actions have no space of their own there: name their recordings, "
-            f"--from {' '.join(sources)}."
-        )
+    world = opened.cache.world
+    assert controls is not None
     if not opened.embodiment:
         raise DatasetError(f"{opened.name} does not say of which body its actions are (robot_type in meta/info.json).")
     shape = tuple(world.get("action_shape") or (len(controls.low),))
