@@ -19,6 +19,20 @@ from terrella.space.raster.move import quaternion_of, transform
 
 from .test_raster import LENS, POSES, cloud, parts
 
+
+@pytest.mark.parametrize("kind", ["", "compressed"])
+@pytest.mark.parametrize("axes", ["rdf", "rub", "flu"])
+def test_a_ply_names_its_axes(tmp_path, kind, axes):
+    scene = cloud(300, 0)
+    write_scene(scene, tmp_path / "a.ply", axes, kind)
+    assert f"\ncomment axes {axes} (x ".encode() in (tmp_path / "a.ply").read_bytes()[:200]
+    read = read_scene(tmp_path / "a.ply").means
+    assert torch.allclose(read.sort(0).values, scene.means.sort(0).values, atol=0.05)
+    content = (tmp_path / "a.ply").read_bytes().replace(f"axes {axes} ".encode(), b"axes xyz ")
+    (tmp_path / "foreign.ply").write_bytes(content)  # as if nothing were said
+    assert torch.equal(read_scene(tmp_path / "foreign.ply").means, read_scene(tmp_path / "a.ply", "rdf").means)
+
+
 CLOSE = {"a.ply": 1e-5, "a.spz": 0.12, "a.4.spz": 0.12, "compressed.ply": 0.08}
 
 

@@ -104,6 +104,12 @@ def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
         assert isinstance(again, SplatWorld) and isinstance(world, SplatWorld)
         off = again.gaussians.means - world.gaussians.means
         assert off.abs().max() < 1e-3
+    lift = torch.tensor([0, 0, 2.0])
+    write_scene(replace(room(), means=room().means + lift), tmp_path / "up.ply")
+    assert main(["space", "import", str(tmp_path / "up.ply"), "--out", str(tmp_path / "up"), "--size", "24", "32"]) == 0
+    assert main(["space", "export", str(tmp_path / "up"), str(tmp_path / "down.ply"), "--ground"]) == 0
+    down = read_scene(tmp_path / "up.ply").means - read_scene(tmp_path / "down.ply").means
+    assert torch.allclose(down, lift.expand_as(down), atol=0.1)
     (tmp_path / "bad.ply").write_bytes(b"ply\n")
     assert main(["space", "import", str(tmp_path / "bad.ply"), "--out", str(tmp_path / "b")]) == 2
     assert not (tmp_path / "b").exists()

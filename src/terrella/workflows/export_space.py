@@ -36,6 +36,7 @@ OPTIONS = {  # the files that each option is for
     "spz": (".spz",),
     "kind": (".glb",),
     "cell": (".glb",),
+    "ground": (".ply", ".spz", ".glb"),
     "seconds": (".mp4",),
     "path": (".mp4",),
     "aspect": (".mp4",),
@@ -61,6 +62,7 @@ class ExportSpaceConfig:
     kind: Literal["mesh", "collider", "gaussians"] = "mesh"
     """Content of a .glb: a mesh with colours, the mesh that stops bodies, or the Gaussians (KHR_gaussian_splatting)."""
     cell: float = 0.05  # Size of a cell of the mesh, in metres.
+    ground: bool = False  # Move the floor below the first start to height 0.
     seconds: float = 8.0  # Duration of the film, in seconds.
     path: Path | None = None
     """Path of the film: a JSON list of [x, y, z, degrees] or [x, y, z, degrees, degrees upwards]. Default: a look around from
@@ -91,7 +93,9 @@ def export_space(
     elif suffix in (".glb", ".png", ".mp4"):
         content, facts = _drawn(open_splat(world), suffix, config, drawing)
     else:
-        shown = _opaque(open_splat(world).gaussians)
+        opened = open_splat(world)
+        shown = _opaque(opened.gaussians)
+        shown = replace(shown, means=shown.means - _ground(opened, config))
         write_scene(shown, file, config.axes, "compressed" if config.compressed else "", config.spz)
         content, facts = None, {"gaussians": len(shown)}
     if content is not None:
@@ -116,6 +120,12 @@ def exported_file(world: str, wish: Mapping[str, Any], drawing: Drawing = lambda
             config = ExportSpaceConfig(seconds=seconds, path=path, aspect=16 / 9, exposure=exposure)
         export_space(world, file, config, drawing)
         return file.read_bytes()
+
+
+def _ground(world: SplatWorld, config: ExportSpaceConfig) -> torch.Tensor:
+    """What is subtracted from positions [3], in metres."""
+    floor = world.collider.floor(world.starts[:1, :3], world.config.body) if config.ground else torch.zeros(1)
+    return torch.cat([torch.zeros(2), floor])
 
 
 def _opaque(gaussians: Gaussians) -> Gaussians:
@@ -143,6 +153,7 @@ def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str,
     rot = torch.tensor(AXES["rub"], dtype=torch.float32)
     if config.kind == "gaussians":
         shown = _opaque(world.gaussians)
+        shown = replace(shown, means=shown.means - _ground(world, config))
         return encode_gaussians(transform(shown, rot), world.name), {"gaussians": len(shown)}
     if not 0.005 <= config.cell <= 10:
         raise TerrellaError("--cell is from 0.005 to 10 metres.")
@@ -156,7 +167,8 @@ def _glb(world: SplatWorld, config: ExportSpaceConfig) -> tuple[bytes, dict[str,
             f"the mesh has {len(mesh.faces):,} faces, {MOST_FACES:,} is the most; ask for a larger --cell."
         )
     facts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    return encode_mesh(replace(mesh, vertices=mesh.vertices @ rot.T), world.name), facts
+    vertices = (mesh.vertices - _ground(world, config)) @ rot.T
+    return encode_mesh(replace(mesh, vertices=vertices), world.name), facts
 
 
 def _panorama(world: SplatWorld, config: ExportSpaceConfig, height: int = 1024) -> tuple[bytes, dict[str, Any]]:

@@ -25,8 +25,8 @@ _USUAL = {".ply": "rdf", ".spz": "rub"}
 
 def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
     """The Gaussians of a .ply (plain or compressed), .spz (versions 1 to 4), .sog (or its folder) or .glb
-    (KHR_gaussian_splatting). `axes`: the file's, default rub for SPZ and GLB, else rdf. Gaussians that are not finite or farther
-    than 10 km are left out with a warning. DatasetError for a broken file."""
+    (KHR_gaussian_splatting). `axes`: the file's, default rub for SPZ and GLB, else those that its header names, else rdf. Gaussians
+    that are not finite or farther than 10 km are left out with a warning. DatasetError for a broken file."""
     path = Path(path)
     if path.suffix.lower() in GLTF_ENDINGS:
         scene = read_gltf(path)
@@ -47,7 +47,7 @@ def read_scene(path: str | Path, axes: str | None = None) -> Gaussians:
                 warnings.warn(f"its points become Gaussians; left out: {', '.join(others)}.", stacklevel=2)
             if "chunk" not in elements and (others := ply.other_columns(elements["vertex"])):
                 warnings.warn(f"left out: its columns {', '.join(others)}.", stacklevel=2)
-            usual = "rdf"
+            usual = ply.stated_axes(data) or "rdf"
         elif data[:2] == b"\x1f\x8b" or data[:4] == spz.MAGIC:
             scene, usual = spz.decode(data), "rub"
         elif data[:2] == b"PK":
@@ -91,11 +91,12 @@ def write_scene(
         raise DatasetError(f"{path} was not written: there is no Gaussian left to write.")
     if kind == "compressed" and path.suffix.lower() != ".ply":
         raise DatasetError(f"{path}: the compressed kind is one of .ply; SPZ is compressed by itself.")
-    exported = transform(gaussians, _axes(axes or _USUAL[path.suffix.lower()]))
+    axes = axes or _USUAL[path.suffix.lower()]
+    exported = transform(gaussians, _axes(axes))
     if path.suffix.lower() == ".spz":
         data = spz.encode(exported, version)
     else:
-        data = compressed.encode(exported) if kind == "compressed" else ply.encode(exported)
+        data = compressed.encode(exported, axes) if kind == "compressed" else ply.encode(exported, axes)
     replace_whole(path, lambda staged: staged.write_bytes(data))
 
 

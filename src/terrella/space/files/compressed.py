@@ -72,7 +72,7 @@ def packed_quats(quats: torch.Tensor) -> torch.Tensor:
     return (which << 30) | (three[:, 0] << 20) | (three[:, 1] << 10) | three[:, 2]
 
 
-def encode(gaussians: Gaussians) -> bytes:
+def encode(gaussians: Gaussians, axes: str = "rdf") -> bytes:
     """A compressed PLY, with the Gaussians in Morton order, so that blocks are small in space."""
     low = gaussians.means.amin(0)
     cell = (gaussians.means - low) / (gaussians.means.amax(0) - low).clamp_min(1e-9) * 1023
@@ -102,7 +102,7 @@ def encode(gaussians: Gaussians) -> bytes:
     if rest.shape[1]:
         lines += [f"element sh {count}", *(f"property uchar f_rest_{k}" for k in range(rest.shape[1]))]
         body += ((rest / 8 + 0.5) * 256).floor().clamp(0, 255).numpy().astype("u1").tobytes()
-    return ply.header(lines) + body
+    return ply.header(lines, axes) + body
 
 
 def _packed(shares: torch.Tensor) -> torch.Tensor:

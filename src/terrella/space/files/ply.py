@@ -17,6 +17,9 @@ _TYPES = {
 }  # fmt: skip
 _COLUMN = re.compile(r"[xyz]|(diffuse_)?(red|green|blue)|[rgb]|alpha|opacity|(f_dc|f_rest|scale|rot)_\d+")
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+_SPELT = {
+    "rdf": "x right, y down, z forward", "rub": "x right, y up, z back", "flu": "x forward, y left, z up",
+}  # fmt: skip
 
 
 def parse(data: bytes) -> dict[str, np.ndarray]:
@@ -156,8 +159,8 @@ def full_scale(kind: np.dtype, most: float) -> float:
     return next(level for level in (255.0, min(65535.0, largest), largest) if most <= level)
 
 
-def encode(gaussians: Gaussians) -> bytes:
-    """As 3D Gaussian Splatting's code writes a scene."""
+def encode(gaussians: Gaussians, axes: str = "rdf") -> bytes:
+    """As 3D Gaussian Splatting's code writes a scene; its header names the axes."""
     rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1)
     parts = [
         gaussians.means, torch.zeros_like(gaussians.means), gaussians.sh[:, 0], rest,
@@ -167,9 +170,17 @@ def encode(gaussians: Gaussians) -> bytes:
     names += [f"f_rest_{k}" for k in range(rest.shape[1])] + ["opacity", "scale_0", "scale_1", "scale_2"]
     names += ["rot_0", "rot_1", "rot_2", "rot_3"]
     lines = [f"element vertex {len(gaussians)}", *(f"property float {name}" for name in names)]
-    return header(lines) + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
+    return header(lines, axes) + torch.cat(parts, 1).numpy().astype("<f4").tobytes()
 
 
-def header(lines: list[str]) -> bytes:
-    """A header with these lines of elements and properties."""
-    return "\n".join(["ply", "format binary_little_endian 1.0", *lines, "end_header", ""]).encode()
+def header(lines: list[str], axes: str) -> bytes:
+    """A header with these lines of elements and properties, which names the axes."""
+    comment = f"comment axes {axes} ({_SPELT.get(axes, axes)}), metres"
+    return "\n".join(["ply", "format binary_little_endian 1.0", comment, *lines, "end_header", ""]).encode()
+
+
+def stated_axes(data: bytes) -> str | None:
+    """The axes that the header of a file names; None where it names none of ours."""
+    stated = re.search(rb"^comment axes (\w+)", data[: _header(data)[2]], re.MULTILINE)
+    name = stated[1].decode() if stated else ""
+    return name if name in _SPELT else None
