@@ -111,6 +111,8 @@ def test_a_step_sees_known_and_unknown_and_adds_only_where_nothing_was():
     start = planar_pose(ZERO, ZERO, EYE[2], ZERO)[None]
     before, after = (rasterise(one, start, CAMERA, (64, 64)) for one in (scene, whole))
     assert psnr_of(after.rgb[0], before.rgb[0], before.alpha[0] > 0.5) > 40
+    fine = rasterise(whole, view.pose[None], CAMERA, (768, 768)).alpha[0, 16:-16, 16:-16]
+    assert float((fine < 0.8).float().mean()) < 1e-4  # no dark line between known and new
 
 
 def test_what_would_cover_a_seen_surface_is_left_out():

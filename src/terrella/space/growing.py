@@ -20,6 +20,7 @@ SIDE, LOOK = 192, 12  # pixels of a step's view, and of its trial
 ROWS = 64  # of panoramas that measure coverage
 YAWS, PITCHES = 12, (-1.2, -0.6, 0.0, 0.6, 1.2)
 LEAST_KNOWN = 0.4  # share of a view
+BEHIND = 0.01  # share of its depth by which what is added at the edge of the known lies behind it
 FREE_M, FREE = 0.1, 0.05  # what lies this much before a known surface would cover it: metres, and a share
 
 Fill = Callable[[Drawing, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
@@ -96,8 +97,12 @@ def grow_step(gaussians: Gaussians, view: GrowthView, fill: Fill, seen: list[tup
     edge = known & (F.max_pool2d((~known).float()[None, None], 9, 1, 4)[0, 0] > 0)
     seam = float((depth[edge] / surface[edge] - 1).abs().median()) if bool(edge.any()) else 0.0
     turn = rotation(pose)
+    some = (
+        F.max_pool2d((~known).float()[None, None], 3, 1, 1)[0, 0] > 0
+    )  # and a pixel more, else seams show as dark lines
+    depth = torch.where(known, torch.maximum(depth, surface * (1 + BEHIND)), depth)
     points = depth[..., None] * rays(CAMERA, SIDE, SIDE) @ turn.T
-    some = ~known & ~_covers(gaussians, points + pose[:3], seen)
+    some &= ~_covers(gaussians, points + pose[:3], seen)
     added = of_pixels(points, depth, depth / (CAMERA[0] * SIDE), rgb, some, (-turn[:, 1], -turn[:, 2]), 0.0)
     return Grown(replace(added, means=added.means + pose[:3]), seam)
 
