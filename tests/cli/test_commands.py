@@ -40,7 +40,7 @@ OPTIONS = {
     "--updates --within",
     "plan": "--adapter --agent --apart --block --budget-ms --colour "
     "--cost --decay --device --elites --episodes --fps --goal --horizon --iterations --json --keep "
-    "--momentum --no-curve --out --proposal --randomise --real --replan --rollouts --samples --search "
+    "--memory-mb --momentum --no-curve --out --proposal --randomise --real --replan --rollouts --samples --search "
     "--seed --size --skills --spread --steps --success --task --temperature --trust --watts --within",
     "skills learn": "--batch --json --learning-rate --out --policy --save-every-s --seed --steps",
     "skills list": "--json",

@@ -180,10 +180,32 @@ def test_the_energy_of_a_decision_stands_beside_its_time(capsys, tmp_path):
     assert found["futures_bytes"] > 0 and "watts" not in found
 
 
-@pytest.mark.parametrize("extra", [["--watts", "0"], ["--watts", "5", "--agent", "random"]])
-def test_watts_that_nothing_keeps_are_refused(extra, capsys, tmp_path):
+def test_a_budget_of_memory_takes_plans(capsys, tmp_path):
+    search = terrella.SearchConfig(samples=32, horizon=4)
+    plain = open_study(BLIND, PlanConfig("20", within=0.001, search=search, out=tmp_path), lambda line: None)
+    assert plain.decision is not None and plain.decision.future_bytes % 32 == 0
+    one = plain.decision.future_bytes // 32
+    for futures, samples, said in (
+        (40, 32, ""), (10, 10, "searches 10 of 32 plans a round"), (1, 2, "cannot be kept: its futures hold"),
+    ):  # fmt: skip
+        lines, budget = list[str](), (futures + 0.1) * one / 2**20
+        config = PlanConfig("20", within=0.001, memory_mb=budget, search=search, out=tmp_path)
+        study = open_study(BLIND, config, lines.append)
+        assert study.search.samples == samples and said in "".join(lines) and bool(said) == bool(lines)
+        assert study.decision is not None and study.decision.facts()["memory_kept"] == (futures > 1)
+
+
+@pytest.mark.parametrize(
+    "named, extra",
+    [
+        ("--watts", ["--watts", "0"]),
+        ("--watts", ["--watts", "5", "--agent", "random"]),
+        ("--memory-mb", ["--memory-mb", "-1"]),
+    ],
+)
+def test_budgets_that_nothing_keeps_are_refused(named, extra, capsys, tmp_path):
     assert main(["plan", BLIND, "--goal", "20", *QUICK, *extra, "--out", str(tmp_path)]) == 2
-    assert "--watts" in capsys.readouterr().err
+    assert named in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--cost", "last"], ["--proposal", "constant:2"]])

@@ -2,8 +2,11 @@
 
 import pytest
 
+import terrella
 from terrella.core.errors import TerrellaError
 from terrella.workflows import pace
+from terrella.workflows import play as playing
+from terrella.workflows.play import PlayConfig
 from terrella.worlds.learned import LearnedWorld
 
 from .test_flow import network, world
@@ -24,3 +27,16 @@ def test_a_pace_is_measured_and_at_most_the_worlds_own():
     assert 0 < pace.frame_s(world(network(moves=0))) < 10
     with pytest.raises(TerrellaError, match="has 10 steps a second"):
         pace.at_pace(world(network(moves=0)), 11, print)
+
+
+def test_a_budget_of_memory_says_what_is_forgotten_sooner():
+    words: list[str] = []
+    for budget, said in (
+        (4.0, "views of its way, in"), (16.0, "MiB an episode"), (0.0, "--memory-mb 0 cannot hold one"),
+    ):  # fmt: skip
+        pace.say_memory(terrella.load("doom-maze", memory_mb=budget), budget, words.append)
+        assert said in words[-1] and ("older ones are forgotten sooner" in words[-1]) == (budget < 16)
+    with pytest.raises(TerrellaError, match="keeps its last pictures alone"):
+        pace.say_memory(world(network(moves=0)), 4.0, words.append)
+    with pytest.raises(TerrellaError, match="--memory-mb -1 is no memory"):
+        playing._check(PlayConfig(memory_mb=-1.0))

@@ -1,4 +1,4 @@
-"""Frames a second that play is to keep: a world of frames is drawn in as many steps as leave that pace."""
+"""Budgets of play: frames a second, for which a world of frames is drawn in fewer steps, and memory of what was seen."""
 
 import statistics
 import time
@@ -8,6 +8,8 @@ import torch
 from ..core.errors import TerrellaError
 from ..core.spec import neutral_action
 from ..core.world import World, make_rng
+from ..worlds.config import KeyframesConfig
+from ..worlds.keyframe_scene import KeyframeScene
 from ..worlds.learned import LearnedWorld
 from .progress import Progress
 
@@ -36,6 +38,22 @@ def at_pace(world: World, fps: float, progress: Progress) -> World:
             f"{world.spec.name} cannot keep {fps:g} frames a second here: {reached:.2g} is the most{given and ',' + given}"
         )
     return drawn
+
+
+def say_memory(world: World, memory_mb: float, progress: Progress) -> None:
+    """Says what an episode of the world, opened with the budget, remembers of its way, and what is given up. TerrellaError for a
+    world that remembers nothing which a budget could limit."""
+    if not isinstance(world, LearnedWorld):
+        return  # a memory that was added says what it needs
+    if not isinstance(world.scene, KeyframeScene):
+        raise TerrellaError(
+            f"{world.spec.name} keeps its last pictures alone, the same memory for any way; leave --memory-mb out."
+        )
+    own, usual = world.scene.own, world.scene.with_memory(budget_mb=KeyframesConfig.memory_mb).own.capacity
+    holds = f"{own.capacity} view{'s' * (own.capacity != 1)} of its way, in {own.nbytes / 2**20:.2g} MiB an episode"
+    less = f", not {usual}: older ones are forgotten sooner" if own.capacity < usual else ""
+    over = f"; --memory-mb {memory_mb:g} cannot hold one" if own.nbytes > memory_mb * 2**20 else ""
+    progress(f"{world.spec.name} remembers {holds}{less}{over}")
 
 
 @torch.inference_mode()

@@ -23,7 +23,15 @@ def plan(
     if config.skills is not None:
         return plan_with_skills(name, config, progress=progress)
     if config.agent:
-        refuse(config, f"{config.agent} acts in place of the search", "cost", "proposal", "watts", *vars(config.search))
+        refuse(
+            config,
+            f"{config.agent} acts in place of the search",
+            "cost",
+            "proposal",
+            "watts",
+            "memory_mb",
+            *vars(config.search),
+        )
     study = open_study(name, config, progress)
     folder = Path(config.out or f"plans/{folder_name(name)}")
     played = study.run()

@@ -36,7 +36,7 @@ from .compute_curve import CurvePoint, compute_of, figures_of, halved
 from .goals import REWARD, read_goal
 from .opening import Device, EnvironmentConfig, device_of, load_named
 from .place_goals import WALK_S, PlaceGoals, is_recording, views_of, walking_defaults
-from .plan_energy import DecisionCost, priced
+from .plan_energy import DecisionCost, PlanBudget, priced
 from .progress import Progress, stage, stopping_with
 from .real_environment import STEPS, check_alike, comparable_channels, open_copied, open_real, refuse_randomised
 from .trust import search_within_trust, trusted_searches
@@ -73,6 +73,9 @@ class PlanConfig:
     """Power that planning may take, in watts, at one decision each --replan moves: for it down to a sixteenth of the plans and
     one round are searched, and the result says how many, or that it is not kept. Without an energy counter that may be read,
     watts are estimated from processor time."""
+    memory_mb: float | None = None
+    """Memory that the futures of one episode may take, in MiB: fewer plans a round are searched to keep it, and the result says
+    how many."""
     rollouts: int = 0
     """With --skills: rollouts in the world of each of the four likeliest plans, to choose among them. Default: 0, none."""
     real: str | None = None  # The environment to act in (gym:CartPole-v1); default: the world itself.
@@ -260,14 +263,17 @@ def open_study(name: str, config: PlanConfig, progress: Progress) -> PlanStudy:
 
 
 def _priced(study: PlanStudy, policy: Callable[[SearchConfig], Policy]) -> PlanStudy:
-    """The study with what a decision costs, and a search that keeps --watts. A route that is not known costs nothing."""
+    """The study with what a decision costs, and a search that keeps the budget. A route that is not known costs nothing."""
     config, cuda = study.config, device_of(study.config.device).startswith("cuda")
     try:
         with stopping_with("stopped before the first decision."):
-            search, cost = priced(study.search, config.watts, policy, study.real, study.sees, cuda, config.seed)
+            budget = PlanBudget(config.watts, config.memory_mb)
+            search, cost = priced(study.search, budget, policy, study.real, study.sees, cuda, config.seed)
     except NoRoute:
-        if config.watts is not None:
-            study.progress("--watts is not kept: no way to the first view is known, so no decision could be measured.")
+        if config.watts is not None or config.memory_mb is not None:
+            study.progress(
+                "The budget is not kept: no way to the first view is known, so no decision could be measured."
+            )
         return study
     for line in cost.lines()[1:]:
         study.progress(line)

@@ -22,7 +22,7 @@ from ..serve.agent import Agents
 from ..serve.guard import is_loopback
 from .key_keeper import KeyKeeper
 from .opening import ControlsConfig, Device, Fast, device_of, load_named
-from .pace import at_pace
+from .pace import at_pace, say_memory
 from .page_agents import PageAgents
 from .progress import Progress, silent
 
@@ -121,6 +121,8 @@ def _loaded(name: str, config: PlayConfig, progress: Progress) -> World:
                 options["size"] = size
                 break
     world = load_named(name, config.device, config.memory, config.fast, **options)
+    if config.memory_mb is not None:
+        say_memory(world, config.memory_mb, progress)
     return world if config.fps is None else at_pace(world, config.fps, progress)
 
 
@@ -163,6 +165,8 @@ def _check(config: PlayConfig) -> None:
         raise TerrellaError("--policy and --agent both say who drives; give one of them.")
     if config.watts is not None and not config.watts > 0:
         raise TerrellaError(f"--watts {config.watts:g} is no power to play with; give watts above 0, as in --watts 5.")
+    if config.memory_mb is not None and not config.memory_mb >= 0:
+        raise TerrellaError(f"--memory-mb {config.memory_mb:g} is no memory; give 0 or more MiB, as in --memory-mb 8.")
     if not config.agent_ms > 0:
         raise TerrellaError("--agent-ms is a time above 0.")
     if config.compare and config.image is not None:

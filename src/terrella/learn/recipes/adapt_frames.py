@@ -47,6 +47,7 @@ def adapt_frames(
     kept = recordings.get("old")
 
     def errors(**of: LearnedWorld) -> dict[str, dict[str, float]]:
+        report(0, 1, "measuring its errors")
         return {name: frame_errors(of[name], recording) for name, recording in recordings.items()}
 
     before = errors(new=_placed(world, recordings["new"]) if places else world, old=world)

@@ -29,6 +29,13 @@ function counted(names) {
   return [...many].map(([name, count]) => (count > 1 ? `${count} × ${name}` : name)).join(', ');
 }
 
+/** The steps for which it is trusted: those that were measured, and its own forecast. */
+function trusted({ trust_steps_measured: measured, trust_measured: how, trust_steps_forecast: forecast }, dt) {
+  const words = (steps) => `${(steps * dt).toFixed(1)} seconds (${steps} steps)`;
+  if (!measured) return forecast ? `${words(forecast)}, by its own forecast` : null;
+  return `${words(measured)}, measured ${how ?? ''}${forecast ? `; by its own forecast ${forecast} steps` : ''}`;
+}
+
 /** What a person asks first, as [word, sentence]. */
 function plainly({ card, dt_s: dt, cameras, mapped }) {
   const frames = Number(String(card.data ?? '').match(/^([\d,]+) frames/)?.[1].replaceAll(',', ''));
@@ -43,8 +50,9 @@ function plainly({ card, dt_s: dt, cameras, mapped }) {
     ['Built from', card.text ? `the words “${card.text}”` : card.kind === 'splat' ? card.file : null],
     ['In it', counted(card.kind === 'splat' && Array.isArray(card.objects) ? card.objects : [])],
     ['Usual error', card.uncertainty?.sure && card.kind !== 'splat' ? `${(100 * card.uncertainty.sure).toFixed(1)}% of full brightness, in a picture that it is sure of` : null],
-    ['Trusted for', card.trust_steps_forecast ? `${(card.trust_steps_forecast * dt).toFixed(1)} seconds (${card.trust_steps_forecast} steps), by its own forecast${card.trust_steps_measured ? `; measured: ${card.trust_steps_measured} steps ${card.trust_measured}` : ''}` : null],
+    ['Trusted for', trusted(card, dt)],
     ['A picture costs', card.joules_per_frame_estimated ? `about ${card.joules_per_frame_estimated} joules, estimated` : null],
+    ['A session holds', card.session_kib ? `${(card.session_kib / 1024).toFixed(1)} MiB of memory` : null],
     ['Laws of physics', card.laws_passed],
     ['Physics', card.physics],
   ].filter(([, words]) => words);
