@@ -37,7 +37,9 @@ def rushed(kind: type[Corridor]) -> Corridor:
 def short_stages(monkeypatch):
     monkeypatch.setattr(adapt_frames, "ROLLOUTS", 4)
     monkeypatch.setattr(
-        adapting, "settings_of", lambda world: replace(settings_of(world), motion_steps=20, outcome_steps=3)
+        adapting,
+        "settings_of",
+        lambda world: replace(settings_of(world), motion_steps=20, outcome_steps=3, uncertainty_frames=0),
     )
 
 
@@ -60,6 +62,24 @@ def test_it_goes_on_in_the_places_of_the_new_recording_and_measures_both(shared,
     assert errors["new"]["before"] == pytest.approx(frame_errors(placed, fast), rel=0.02), "with the new places"
     assert "On the old one" in facts["verdict"]
     assert adapt(world, new, tmp_path / "run", FEW, quiet, corridor)["errors"] == errors  # finished: as it was
+
+
+def test_its_estimator_stays_for_the_same_camera(shared, corridor, posed_run, tmp_path):
+    world, few = load_world(posed_run[0] / "world"), replace(FEW, steps=1)
+    for data, same in ((corridor, True), (recorded(shared, "narrow", narrow()), False)):
+        adapt(world, data, tmp_path / f"{same}", few, quiet)
+        adapted = load_world(tmp_path / f"{same}" / "world")
+        weights, kept = (one.estimator.state_dict() for one in (adapted, world))
+        assert all(torch.equal(weights[name], kept[name]) for name in kept) == same
+        assert adapted.estimator.config.camera == adapted.config.camera
+
+
+def narrow() -> Corridor:
+    """Seen by a camera with a narrower field of view."""
+    world = Corridor()
+    camera = replace(world.spec.cameras["rgb"], intrinsics=(0.7, 0.8, 0.5, 0.5))
+    world.spec = replace(world.spec, cameras={"rgb": camera})
+    return world
 
 
 @pytest.mark.slow

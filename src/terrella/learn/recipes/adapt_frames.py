@@ -39,12 +39,15 @@ def adapt_frames(
 ) -> tuple[dict, dict]:
     """Trains, or resumes, a copy of the world on `data`, beside `keep`; returns the facts of the run, and the errors of both
     recordings before and after, as `frame_errors`. Size, history and step count follow the world. A world of places gets those of
-    `data`, and is measured on `data` with them before, too, and on `keep` with its own."""
+    `data`, and is measured on `data` with them before, too, and on `keep` with its own. Its estimator is learned anew for another
+    camera."""
     places = isinstance(world.body, MotionBody) and isinstance(world.scene, KeyframeScene)
     if not places and world.generator.kind != "flow":
         raise TrainingError(f"{world.spec.name} does not adapt: it is no world that `terrella train video` makes now.")
     recordings = {name: _fitting(world, one, report) for name, one in (("new", data), ("old", keep)) if one is not None}
     kept = recordings.get("old")
+    if world.estimator and tuple(recordings["new"].cache.world["camera"]) == tuple(world.estimator.config.camera):
+        settings = replace(settings, estimator_steps=0)  # it keeps its estimator
 
     def errors(**of: LearnedWorld) -> dict[str, dict[str, float]]:
         report(0, 1, "measuring its errors")

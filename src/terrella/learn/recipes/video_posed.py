@@ -124,6 +124,7 @@ class PosedRecipe:
             body=MotionBody(copy.deepcopy(self.motion), replace(video.motion, **fitted)),
             objects=copy.deepcopy(self.objects),
             outcome=parts.trained_outcome(ConstantConfig(usual, terminal)),
+            estimator=None if self.begin is None or parts.config.estimator_steps else self.begin.world.estimator,
         )
 
     def _first_rows(self) -> np.ndarray:
