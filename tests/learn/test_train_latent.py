@@ -292,6 +292,7 @@ def test_the_verdict_says_how_far_to_plan_and_what_is_lost():
     assert "after 1 step;" in verdict(arms(0.3, 0.6, 0.4), {})
     assert "hardly depends on the actions" in verdict(arms(0.1, 0.1, 0.4), {})
     assert "do not plan in it" in verdict(arms(0.5, 0.6, 0.4), {})
+    assert "after 8 steps; it has one action" in verdict(arms(0.1, 0.1, 0.4), {}, acts=False)
 
 
 def test_fewer_clips_than_a_batch_are_one_batch(tmp_path):

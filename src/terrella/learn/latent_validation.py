@@ -146,7 +146,7 @@ def validate(world: LatentWorld, recording: Recording, horizons: Sequence[int] =
     expected = world.network.expected(torch.cat([rolled.spread[step] for step in rolled.steps])).cpu()
     table = _rounded(rolled.table())
     return {
-        "verdict": verdict(table["latent"], probe),
+        "verdict": verdict(table["latent"], probe, world.controls.low != world.controls.high),
         "errors": table,
         "probe_r2": _rounded(probe),
         "effective_rank": round(effective_rank(fitted), 2),
@@ -155,14 +155,17 @@ def validate(world: LatentWorld, recording: Recording, horizons: Sequence[int] =
     }
 
 
-def verdict(errors: Mapping[str, Mapping[str, float]], probe: Mapping[str, float]) -> str:
+def verdict(errors: Mapping[str, Mapping[str, float]], probe: Mapping[str, float], acts: bool = True) -> str:
     """A sentence or two: how far ahead it can be planned in, by the latent's errors of each arm and step, and what latents lack, by
-    the R² of each vector's linear probe."""
+    the R² of each vector's linear probe. acts: whether there is more than one action."""
     true, other, still = (errors[arm] for arm in ARMS)
     predicts = [step for step in true if true[step] < CLEARLY * still[step]]
     obeys = [step for step in predicts if true[step] < CLEARLY * other[step]]
     if not predicts:
         words = "It predicts no better than copy-last: do not plan in it. Train longer (--steps), or record more."
+    elif not acts:
+        last = f"{predicts[-1]} step{'s'[: int(predicts[-1]) > 1]}"
+        words = f"Better than copy-last after {last}; it has one action, so there is nothing to plan."
     elif not obeys:
         words = "It predicts better than copy-last, but hardly depends on the actions: plans in it cannot be expected to work."
     else:
