@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .workflows.check import CheckConfig, CheckResult, check
     from .workflows.collect import CollectConfig, CollectResult, collect
     from .workflows.evaluate import EvaluateConfig, EvaluateResult, evaluate
+    from .workflows.export_world import export_world
     from .workflows.generate_place import generate_place
     from .workflows.learn import LearnConfig, LearnResult, learn
     from .workflows.lift_space import LiftSpaceConfig
@@ -54,6 +55,7 @@ _NAMES = {
     ".workflows.check": ("CheckConfig", "CheckResult", "check"),
     ".workflows.collect": ("CollectConfig", "CollectResult", "collect"),
     ".workflows.evaluate": ("EvaluateConfig", "EvaluateResult", "evaluate"),
+    ".workflows.export_world": ("export_world",),
     ".workflows.generate_place": ("generate_place",),
     ".workflows.learn": ("LearnConfig", "LearnResult"),
     ".workflows.lift_space": ("LiftSpaceConfig",),

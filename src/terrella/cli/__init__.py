@@ -59,6 +59,7 @@ COMMANDS = {
     "train distil": ("train:few_steps", "distil a world that draws a frame in many steps into one of one or two"),
     "train dreams": ("train:dreams", "continue training a world on its own rollouts"),
     "export policy": ("export:policy", "write a learned policy as an ONNX file that runs without PyTorch"),
+    "export world": ("export:world", "write a learned world of frames as one HTML file that runs in any browser"),
     "score": ("score:score", "compare a world's predictions with a recording"),
     "check": ("physics:check", "check which laws of physics a world's predictions keep"),
     "space fit": ("space:fit", "fit a place of Gaussians to a recording, photographs or a video"),

@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from .. import library
 from ..core.errors import TerrellaError
-from .say import Json, result
+from .say import Json, WorldName, result
 
 
 def policy(name: Annotated[Path, Positional, arg(metavar="POLICY")], world: str, out: Path, json: Json = False) -> None:
@@ -32,3 +32,15 @@ def policy(name: Annotated[Path, Positional, arg(metavar="POLICY")], world: str,
     facts = {"file": str(out), "inputs": inputs, "outputs": {"action": [-1, *(spec.action.shape or ())]}}
     facts |= {"action_names": list(spec.action_names), "action_units": list(spec.action_units), "control_s": spec.dt_s}
     result(facts, json)
+
+
+def world(name: WorldName, out: Path, json: Json = False) -> None:
+    """Write a learned world of frames as one HTML file that anybody plays in a browser: no server, no installation, no network.
+
+    Args:
+        name: A world without depth and poses, such as islet or the run of `terrella learn`.
+        out: The file, NAME.html.
+    """
+    from ..workflows.export_world import export_world
+
+    result(export_world(name, out), json)

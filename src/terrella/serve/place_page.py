@@ -65,7 +65,7 @@ class PlacePage:
         self._style = (WEB / "style.css").read_text("utf-8") + (PAGE / "place.css").read_text("utf-8")
         self._script = f"(async () => {{\n'use strict';\n{bundle_script(PAGE / 'app.js')}}})();"
         self.policy = (
-            f"default-src 'none'; script-src {_hash(self._script)}; worker-src blob:; style-src {_hash(self._style)}; "
+            f"default-src 'none'; script-src {hash_of(self._script)}; worker-src blob:; style-src {hash_of(self._style)}; "
             "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'"
         )
 
@@ -188,7 +188,7 @@ def _module(file: Path, last: bool) -> str:
     return body if last else f"const m_{file.stem} = (() => {{\n{body}return {{ {', '.join(names)} }};\n}})();"
 
 
-def _hash(text: str) -> str:
+def hash_of(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
