@@ -207,6 +207,7 @@ def test_whatever_stops_it_the_same_command_goes_on_to_a_world_with_a_card(tmp_p
     again = capsys.readouterr()
     assert "is finished" in again.err and facts["verdict"][0] in again.out and "play it: terrella play" in again.out
     assert f"train it further: terrella learn {NAME} --minutes " in again.out and f"--out {out}" in again.out
+    assert f"as one page for others: terrella export world {out / 'run'} --out {out.name}.html" in again.out
     assert library.folder_of(out) == out / "run" / "world" and (out / "run" / "newest.png").exists()
     assert main([*command(out), "--seed", "5"]) == 2
     assert "seed 0, not 5" in capsys.readouterr().err

@@ -22,6 +22,8 @@ from ..learn.recipes.student import student_settings, train_student
 from ..learn.recipes.video import TrainConfig, train_video
 from ..learn.recording import MOST
 from ..measure import CLIPS, Exam, ExamConfig, most_clips_within, verdict
+from ..worlds.checkpoint import read_about
+from ..worlds.flow import FlowNetwork
 from ..worlds.folder import load_world
 from .collect import explore, open_player, storage_of
 from .learn_environment import held_to_real_time, longest_episode, open_small
@@ -100,6 +102,14 @@ class LearnResult:
     def play(self) -> str:
         return command("terrella", "play", self.world)
 
+    @property
+    def page(self) -> str:
+        """The command that writes it as one page for others; "" where a browser cannot run it."""
+        parts = read_about(self.world / "world")["parts"]
+        if parts["generator"]["kind"] != FlowNetwork.kind or parts["generator"]["config"].get("views"):
+            return ""
+        return command("terrella", "export", "world", self.student or self.world, out=f"{self.world.parent.name}.html")
+
     def to_json(self) -> dict[str, Any]:
         facts: dict[str, Any] = {"verdict": self.verdict} | ({"card": self.card} if self.card else {})
         minutes = {f"{name}_minutes": round(seconds / 60, 2) for name, seconds in self.spent_s.items()}
@@ -116,6 +126,7 @@ class LearnResult:
         few = f"{self.steps} training steps are too few to play it yet." if self.steps < HOPELESS_STEPS else ""
         lines.append(few or f"play it: {self.play}")
         lines += [f"play its student: {command('terrella', 'play', self.student)}"] if self.student else []
+        lines += [f"as one page for others: {self.page}"] if not few and self.page else []
         return "\n".join([*lines, f"train it further: {self.again}"])
 
 
