@@ -162,6 +162,6 @@ def test_recordings_that_one_policy_cannot_learn_from_are_refused(bodies, tmp_pa
     assert main(
         ["skills", "learn", str(recordings["Back"]), "--policy", f"{folder}/run", "--out", f"{tmp_path}/skills"]
     )
-    assert "skills are learned from a policy of one body" in capsys.readouterr().err
+    assert "gym:TerrellaWide-v0; this takes a policy of one body" in capsys.readouterr().err
     assert main(["train", "policy", "--in", "gym:Pendulum-v1", "--from", "a", "b", "--out", f"{tmp_path}/run"])
     assert "only imitation takes several" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from typing import Any, final
 import torch
 
 from ..core import chance
-from ..core.errors import ChannelError
+from ..core.errors import ChannelError, CheckpointError
 from ..core.instruction import bytes_to_text
 from ..core.spec import Spec
 from ..core.state import State
@@ -156,3 +156,14 @@ def load_imitation_network(folder: str | Path) -> tuple[ImitationNetwork, dict[s
         )
 
     return load_network(folder, KIND, VERSION, make)
+
+
+def load_network_of_one_body(folder: str | Path) -> tuple[ImitationNetwork, dict[str, Any]]:
+    """The same; CheckpointError also for a policy of several bodies, for those who do not say which one acts."""
+    network, card = load_imitation_network(folder)
+    if bodies := network.config.bodies:
+        names = " and ".join(body.name for body in bodies)
+        raise CheckpointError(
+            f"{folder} drives {names}; this takes a policy of one body: train it on that one's recordings."
+        )
+    return network, card

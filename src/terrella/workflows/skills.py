@@ -11,13 +11,13 @@ import torch
 from tyro.conf import arg
 
 from ..act.actor import policy_folder
-from ..act.imitation import load_imitation_network
+from ..act.imitation import load_network_of_one_body
 from ..act.planning import FullyObserved
 from ..act.skills.actor import SkillActor
 from ..act.skills.imagined import PlanRollouts
 from ..act.skills.library import SkillLibrary
 from ..act.skills.search import SkillSearch
-from ..core.errors import PlanningError, TerrellaError
+from ..core.errors import TerrellaError
 from ..core.instruction import bytes_to_text
 from ..core.policy import act
 from ..core.world import World, make_rng
@@ -154,12 +154,7 @@ class SkillPlanResult:
 def learn_library(data: str | Path, config: LearnSkillsConfig, *, progress: Progress = silent) -> LibraryResult:
     """Learns skills from a recording and a policy that imitates it: their phrases are mined from its instructions. TerrellaError
     for what cannot be learned from."""
-    network, _ = load_imitation_network(config.policy)
-    if bodies := network.config.bodies:
-        names = " and ".join(body.name for body in bodies)
-        raise PlanningError(
-            f"{config.policy} drives {names}; skills are learned from a policy of one body: train it alone."
-        )
+    network, _ = load_network_of_one_body(config.policy)
     sees, size = [name for name, _ in network.config.actor.sees], network.config.size
     with stage("learning skills", progress) as report:
         recording, _ = open_demonstrations(data, sees, size, report)

@@ -2,6 +2,7 @@
 
 import sys
 
+from terrella.act.imitation import load_network_of_one_body
 from terrella.core.errors import TerrellaError
 
 from .modeling_terrella import from_run, save
@@ -12,6 +13,7 @@ def main(words: list[str]) -> str | None:
     if len(words) != 2:
         return __doc__
     try:
+        load_network_of_one_body(words[0])  # LeRobot does not say which of several bodies acts
         policy = from_run(words[0])
         save(policy, words[1])
     except (TerrellaError, OSError) as error:
