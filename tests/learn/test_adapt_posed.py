@@ -39,7 +39,9 @@ def short_stages(monkeypatch):
     monkeypatch.setattr(
         adapting,
         "settings_of",
-        lambda world: replace(settings_of(world), motion_steps=20, outcome_steps=3, uncertainty_frames=0),
+        lambda world: replace(
+            settings_of(world), motion_steps=20, outcome_steps=3, estimator_steps=3, uncertainty_frames=0
+        ),
     )
 
 
