@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from copy import copy
 from dataclasses import replace
 from shutil import copytree, ignore_patterns
 
@@ -125,6 +126,26 @@ def test_a_batch_holds_every_recording_and_which_body_acted(bodies):
     assert joint_config([several[0], several[0]], 32, Imitation()).bodies == ()  # two recordings of one body
 
 
+def test_recordings_of_one_task_each_are_instructed_where_these_differ(bodies):
+    several = []
+    for name, task in (("Forth", "go left"), ("Back", "go right")):
+        opened, sees = open_demonstrations(bodies[1][name], ("offset",), (64, 64), quiet)
+        own = copy(opened.cache)
+        own.tasks = (task,)
+        several.append((replace(opened, cache=own), sees))
+    assert {"left", "right"} <= {*joint_config(several, 32, Imitation()).vocabulary}
+
+
+def test_a_body_remembers_its_own_numbers_alone(bodies, tmp_path):
+    worlds, recordings, _ = bodies
+    joint = [recordings["Forth"], recordings["Wide"]]
+    acting = Imitation(history=2, own_actions=True)
+    facts = train_imitation(joint, tmp_path / "run", replace(QUICK, steps=2), acting, quiet)
+    policy, rng = terrella.load_policy(facts["policy"], worlds["Forth"].spec), make_rng(0)
+    _, memory = policy.act({"offset": torch.tensor([[0.3]])}, policy.begin(1, rng), rng)
+    assert memory["acted"][0, -1, 0] != 0 and memory["acted"][0, -1, 1] == 0
+
+
 def test_a_merged_recording_holds_each_bodys_own_actions(bodies, tmp_path, capsys):
     worlds, recordings, _ = bodies
     merge = ["data", "merge", *map(str, recordings.values()), "--out", f"{tmp_path}/all"]
@@ -135,6 +156,10 @@ def test_a_merged_recording_holds_each_bodys_own_actions(bodies, tmp_path, capsy
         assert embodiment_of(part) == Embodiment.of(worlds[name].spec) == embodiment_of(original)
         rows = part.usable | np.isin(part.start, [part.cache.ranges[number, 0] for number in part.held_out])
         assert np.allclose(part.cache.action[rows], original.cache.action, atol=1e-6)
+    wide = np.asarray(one.cache.arrays["embodiment"]).reshape(-1) == 2
+    held_out = tuple(number for number, (first, _) in enumerate(one.cache.ranges) if wide[first])
+    third = by_body(replace(one, usable=one.usable & ~wide, held_out=held_out))[2]
+    assert third.usable.any() and not third.held_out, "a body whose episodes were all held out learns from them"
     facts = train_imitation(tmp_path / "all", tmp_path / "run", replace(QUICK, steps=2), Imitation(history=1), quiet)
     assert facts["bodies"] == [f"gym:Terrella{name}-v0" for name in BODIES]
     text = (tmp_path / "all.toml").read_text()
@@ -153,6 +178,8 @@ def test_recordings_that_one_policy_cannot_learn_from_are_refused(bodies, tmp_pa
         train_imitation(joint, tmp_path / "run", replace(QUICK, sees=()), imitation, quiet)
     with pytest.raises(TrainingError, match="take one recording"):
         train_imitation(joint, tmp_path / "run", QUICK, Imitation(remember=4), quiet)
+    with pytest.raises(DatasetError, match="named twice"):
+        train_imitation([joint[0], joint[0]], tmp_path / "run", QUICK, imitation, quiet)
     copytree(recordings["Back"], tmp_path / "other", ignore=ignore_patterns(".cache"))
     about = json.loads((tmp_path / "other/meta/terrella.json").read_text())
     about["world"] |= {"embodiment": "gym:TerrellaForth-v0", "action_mode": "torque"}

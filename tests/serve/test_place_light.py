@@ -75,6 +75,9 @@ def test_what_was_put_is_lit_anew_too(folder):
         ("a sunny attic", "an attic in the evening"),
         ("a library on a cloudy day", "a library in the evening"),
         ("flat", "flat"),
+        ("a sunny bedroom with two night tables", "a bedroom with two night tables in the evening"),
+        ("the evening star hotel", "the evening star hotel"),
+        ("a room by day and by night", "a room by day and by night"),
     ],
 )
 def test_a_time_in_the_name_changes_with_the_light(name, later):

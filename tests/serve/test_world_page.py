@@ -8,10 +8,11 @@ import torch
 import terrella
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
+from terrella.serve.actions import action_of
 from terrella.space.mosaic import empty_mosaic, write_mosaic
 from terrella.workflows.export_world import export_world, page_of
 from terrella.worlds.config import HistoryConfig
-from terrella.worlds.controls import Controls
+from terrella.worlds.controls import AXES, Controls
 from terrella.worlds.flow import FlowConfig, FlowNetwork
 from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.learned import About, LearnedWorld
@@ -115,6 +116,27 @@ def test_the_page_draws_what_pytorch_draws(opened, name):
         drawn = page.evaluate(STEP, [None if number else 0, actions[number][0].tolist(), noise, 3])
         off = (torch.tensor(drawn).view(*world.size, 3) - frame.int()).abs()
         assert off.max() <= 1 and (off > 0).float().mean() < 1e-3, f"step {number}: {off.max()}"
+
+
+@pytest.mark.browser
+def test_axes_of_opposite_keys_and_odd_limits(opened):
+    """As serve/actions.py has it: of two opposites the positive, within the limits."""
+    world = made((32, 32))
+    controls = Controls(AXES, (-0.4, -1.0, 0.0), (0.4, 1.0, 0.5))
+    about = About(
+        "axes",
+        controls,
+        0.1,
+        ("steer", "turn", "gas"),
+        {"KeyA": [-0.4, 0, 0], "KeyD": [0.4, 0, 0], "KeyW": [0, 0, 9.0]},
+    )
+    page = opened(LearnedWorld(about, scene=world.scene, generator=world.generator))
+    for codes in (["KeyA", "KeyD"], ["KeyD", "KeyA"], ["KeyA"], ["KeyW", "KeyA"], []):
+        wanted = action_of(LearnedWorld(about, scene=world.scene, generator=world.generator).spec, codes)[0].tolist()
+        assert page.evaluate(ACTION, codes) == pytest.approx(wanted)
+    assert [text.removeprefix(code) for text, code in zip(page.locator("#keys button").all_text_contents(), "ADW")][
+        :2
+    ] == ["steer −", "steer +"]
 
 
 @pytest.mark.browser

@@ -44,6 +44,8 @@ class ImitationActor:
         self._warned: set[str] = set()
         bodies = network.config.bodies
         self._body = torch.eye(len(bodies))[[index_of(bodies, spec)]] if bodies else None  # [1, bodies]
+        width, own = network.config.action_width, network.config.width_of(spec)
+        self._own = (torch.arange(width) < own).float()  # [action_width], 0 at numbers that this body does not have
 
     @property
     def sees(self) -> tuple[str, ...]:
@@ -111,7 +113,7 @@ class ImitationActor:
                 predicted = network.chunk_of(drawn)
             chunk, taken = torch.where(anew[:, None, None], predicted.cpu(), chunk), torch.where(anew, 0, taken)
         encoded = chunk[torch.arange(batch), taken]
-        acted = torch.cat([memory["acted"][:, 1:], encoded[:, None]], 1)
+        acted = torch.cat([memory["acted"][:, 1:], (encoded * self._own)[:, None]], 1)
         after = {"features": kept, "acted": acted, "words": spoken, "chunk": chunk, "taken": taken + 1}
         after["waypoints"] = waypoints
         return config.decode(encoded, self.spec), State(after), choices

@@ -82,15 +82,19 @@ class ImitationConfig:
         body = self.bodies[index_of(self.bodies, spec)]
         return replace(self.actor, shape=body.shape, low=body.low, high=body.high)
 
+    def width_of(self, spec: Spec) -> int:
+        """Of the numbers of an action as networks see it, those of the body that `spec` drives."""
+        return self.action_width if self.actor.mode == CHOICE else len(self.actor_of(spec).low)
+
     def decode(self, encoded: torch.Tensor, spec: Spec) -> torch.Tensor:
         """Encoded actions [N, action_width] (choices one-hot, buttons 0 or 1, axes from -1 to 1) in the space of `spec`:
         [N, *action.shape]."""
-        if self.actor.mode == AXES:
+        if self.actor.mode != CHOICE:
             actor = self.actor_of(spec)
             encoded = encoded[:, : len(actor.low)]
+            if self.actor.mode == BUTTONS:
+                return actor.actions(encoded, spec)
             return actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
-        if self.actor.mode == BUTTONS:
-            return self.actor.actions(encoded, spec)
         parts = encoded.split(list(self.actor.counts), 1)
         return self.actor.actions(torch.stack([part.argmax(1) for part in parts], 1).float(), spec)
 

@@ -19,7 +19,7 @@ def by_body(opened: Recording) -> list[Recording]:
         return [opened]
     cache, recordings = opened.cache, []
     of_row = np.asarray(cache.arrays["embodiment"]).reshape(-1)
-    of_episode = of_row[cache.ranges[:, 0]]
+    of_episode, of_all = of_row[cache.ranges[:, 0]], Recording.of(cache, list(range(len(cache.episodes))), None).usable
     for body in bodies:
         if not body.get("actions"):
             raise DatasetError(
@@ -34,6 +34,8 @@ def by_body(opened: Recording) -> list[Recording]:
         ].all(1)
         own.world = {**cache.world, **body["actions"]["space"]}
         held_out = tuple(number for number in opened.held_out if of_episode[number] == body["id"])
-        usable = opened.usable & (of_row == body["id"])
+        usable, mine = opened.usable & (of_row == body["id"]), of_all & (of_row == body["id"])
+        if mine.any() and not usable.any():  # all its episodes were held out: it learns from them
+            usable, held_out = mine, ()
         recordings.append(replace(opened, cache=own, controls=controls_of(own), usable=usable, held_out=held_out))
     return recordings

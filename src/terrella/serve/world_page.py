@@ -10,7 +10,7 @@ from typing import Any
 
 from ..core.spec import Spec, neutral_action
 from .http_server import WEB
-from .keys import actions_of
+from .keys import KeyBook
 from .place_page import bundle_script, hash_of
 
 PAGE = WEB / "world"
@@ -22,14 +22,15 @@ def world_html(spec: Spec, network: Mapping[str, Any], weights: bytes, world: Ma
     script = f"(async () => {{\n'use strict';\n{bundle_script(PAGE / 'app.js')}}})();"
     style = (PAGE / "world.css").read_text("utf-8")
     allowed = f"script-src {hash_of(script)} 'wasm-unsafe-eval'; style-src {hash_of(style)}"
-    names = {_row(action.value): action.name + action.sign for action in actions_of(spec)}
+    book = KeyBook(spec).described()
+    named = {code: book["actions"][index] for code, index in book["keys"].items()}
     about = {
         "network": network,
         "world": world,
         "dt_s": spec.dt_s,
         "rest": neutral_action(spec).ravel().tolist(),
         "keys": {code: [float(number) for number in value] for code, value in spec.keys.items()},
-        "names": names,
+        "names": {code: action["name"] + action["sign"] for code, action in named.items()},
     }
     parts = {
         "policy": f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'",
@@ -45,11 +46,6 @@ def world_html(spec: Spec, network: Mapping[str, Any], weights: bytes, world: Ma
     }
     text = (PAGE / "index.html").read_text("utf-8")
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text).encode()
-
-
-def _row(value: tuple[float, ...]) -> str:
-    """A row of numbers as JavaScript writes it."""
-    return ",".join(f"{number:g}" for number in value)
 
 
 def _packed(content: bytes) -> str:

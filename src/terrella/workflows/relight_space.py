@@ -21,10 +21,10 @@ _PHRASES = {
 }  # fmt: skip
 _WORDS = "|".join([*TIMES, *SAME_TIME, "clouds"])
 _TIME = re.compile(
-    rf"(?:^|\s+)(?:at|by|under|in the|in) (?:{_WORDS})\b|(?:^|\s+)(?:on|under) an? (?:{_WORDS}) (?:day|sky)\b"
-    rf"|(?:\ban? )?\b(?:{_WORDS})\b(?: +(?=(\w)))?",
+    rf"(?:^|\s+)(?:at|by|under|in the|in) (?:{_WORDS})\b|(?:^|\s+)(?:on|under) an? (?:{_WORDS}) (?:day|sky)\b",
     re.IGNORECASE,
 )
+_WEATHER = re.compile(r"(?:\ban? )?\b(?:sunny|cloudy|rainy|overcast)\b +(?=(\w))", re.IGNORECASE)
 
 
 def light_of(world: str) -> dict[str, Any] | None:
@@ -59,11 +59,13 @@ def relight_space(world: str, light: Mapping[str, Any], *, progress: Progress = 
 
 
 def name_at(name: str, time: str) -> str:
-    """A place's name at another time: "a sunny loft" at night is "a loft at night". A name without a time stays."""
+    """A place's name at another time: "a sunny loft" at night is "a loft at night". A name without a time, or with
+    several, stays."""
 
     def without(match: re.Match[str]) -> str:
         article = re.match("an? ", match[0], re.IGNORECASE)
         return ("an " if match[1] in tuple("aeiouAEIOU") else "a ") if article else ""
 
-    shorter, times = _TIME.subn(without, name)
-    return f"{shorter.strip()} {_PHRASES[time]}".strip() if times else name
+    shorter, times = _TIME.subn("", name)
+    shorter, weather = _WEATHER.subn(without, shorter)
+    return f"{shorter.strip()} {_PHRASES[time]}".strip() if times < 2 and times + weather else name

@@ -49,6 +49,7 @@ NOT_SEEN = {
 NAMED_ONLY = {"pose", "latent", *PRIVILEGED}  # of these, seen by a policy that names them
 DISCRETE_CHUNK, AXES_CHUNK = 1, 8  # default chunk of actions
 TESTED = 2048  # moments of the final test
+UNINSTRUCTED = "explore "  # with which the text of a recording without a task begins
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,8 @@ def train_imitation(
     out, batch, place = Path(out), practice.batch or 256, device_named(device)
     _check(practice, imitation)
     names = [recording] if isinstance(recording, str | Path) else recording
+    if len({str(name) for name in names}) < len(names):
+        raise DatasetError("a recording is named twice; name each once.")
     opened = [open_demonstrations(name, practice.sees, imitation.picture_size, report) for name in names]
     several = [(part, sees) for one, sees in opened for part in by_body(one)]
     sees, config = several[0][1], joint_config(several, practice.hidden, imitation)
@@ -107,7 +110,8 @@ def train_imitation(
     feed = SizedFeed(lambda size: RandomBatches(lambda now: rows.sample(size, now.rng)), batch)
     trainer = Trainer(run, STAGE, feed, objective, practice.steps or ENDLESS)
     trainer.limit_s = 60 * (practice.minutes or (math.inf if practice.steps else DEFAULT_MINUTES))
-    whom = f"the teacher (channel 'expert') in {recording}" if parts[0].taken is not None else recording
+    taught = all(part.taken is not None for part in parts)
+    whom = f"the teacher (channel 'expert') in {recording}" if taught else recording
     card = {"what": f"A policy that imitates {whom}", "learned_from": recording, "sees": list(sees)}
     card |= {"bodies": [body.name for body in config.bodies]} if config.bodies else {}
 
@@ -162,13 +166,14 @@ def joint_config(
     """The network's shape by several recordings and what is seen of each. DatasetError where these differ, where actions of one
     body do, or where bodies have actions of different kinds; TrainingError for settings that take one recording."""
     first, sees = several[0]
-    instructed = any(len(set(opened.cache.tasks)) > 1 for opened, _ in several)  # one text is a recording's default
+    if len(several) > 1 and (imitation.remember or imitation.outcome):
+        raise TrainingError("--remember and --outcome take one recording of one body; leave them out.")
+    texts = {task for opened, _ in several for task in opened.cache.tasks if not task.startswith(UNINSTRUCTED)}
+    instructed = len(texts) > 1 or any(len(set(opened.cache.tasks)) > 1 for opened, _ in several)
     tasks = [task for opened, _ in several for task in opened.cache.tasks] if instructed else []
     configs = [config_of(opened, sees, hidden, imitation, tasks) for opened, sees in several]
     if len(several) == 1:
         return configs[0]
-    if imitation.remember or imitation.outcome:
-        raise TrainingError("--remember and --outcome take one recording.")
     bodies: dict[str, Embodiment] = {}
     for (opened, _), config in zip(several, configs):
         body, actor = embodiment_of(opened), config.actor
@@ -195,7 +200,9 @@ def embodiment_of(opened: Recording) -> Embodiment:
     world = opened.cache.world
     assert controls is not None
     if not opened.embodiment:
-        raise DatasetError(f"{opened.name} does not say of which body its actions are (robot_type in meta/info.json).")
+        raise DatasetError(
+            f"{opened.name} does not say of which body its actions are (embodiment in meta/terrella.json)."
+        )
     shape = tuple(world.get("action_shape") or (len(controls.low),))
     names, units = (tuple(world.get(f"action_{key}") or ()) for key in ("names", "units"))
     mode, frame = (str(world.get(f"action_{key}") or "") for key in ("mode", "frame"))

@@ -111,8 +111,9 @@ def place_pictures(folder: Path, film: bool, alike: bool, seed: int = 0) -> int:
         (colmap.match_sequential if film and count > _MANY else colmap.match_exhaustive)(database)
         if (error := rotation_error(_pairs(colmap, database))) is not None and error < _TURNED:
             raise DatasetError(
-                f"the camera only turned: rotations alone explain the pictures, to {100 * error:.2f}% of their longer side, "
-                "and so they show no depth. Walk while you take them, or stitch them to a panorama for `terrella space lift`."
+                f"the camera only turned, or moved little beside something flat or far away: rotations alone explain the pictures, "
+                f"to {100 * error:.2f}% of their longer side, so they show no depth. Walk while you take them, or stitch them to a "
+                "panorama for `terrella space lift`."
             )
         models = colmap.incremental_mapping(database, images, work, options=plan)
         best = max(models.values(), key=lambda one: one.num_reg_images()) if models else None

@@ -6,14 +6,18 @@ const GLYPHS = { ArrowUp: '↑', ArrowDown: '↓', ArrowLeft: '←', ArrowRight:
 export const labelOf = (code) => GLYPHS[code] ?? code.replace(/^(Key|Digit)/, '');
 
 /** The action of the keys held, oldest first: `keys` has the row of each code, or of several, "ArrowUp+Space". */
-export function actionOf(kind, rest, keys, held) {
+export function actionOf({ kind, low, high }, rest, keys, held) {
   const together = Object.keys(keys).filter((codes) => codes.includes('+') && codes.split('+').every((code) => held.includes(code)));
   together.sort((one, other) => one.split('+').length - other.split('+').length);
   const rows = [...held, ...together].filter((code) => keys[code]).map((code) => keys[code]);
   if (!rows.length) return rest;
   if (kind === 'buttons') return rest.map((_, i) => Math.max(...rows.map((row) => row[i])));
   if (kind === 'choice') return rest.length === 1 ? rows.at(-1) : rows.reduce((all, row) => all.map((value, i) => (row[i] === rest[i] ? value : row[i])), rest);
-  return rest.map((value, i) => rows.reduce((most, row) => (Math.abs(row[i]) > Math.abs(most) ? row[i] : most), 0) || value);
+  rows.sort((one, other) => Math.max(...other) - Math.max(...one));  // of two opposites, the positive
+  return rest.map((value, i) => {
+    const pressed = rows.reduce((most, row) => (Math.abs(row[i]) > Math.abs(most) ? row[i] : most), 0);
+    return Math.min(high[i], Math.max(low[i], pressed || value));
+  });
 }
 
 /** Buttons as they are, choices one-hot, axes scaled to -1..1. */

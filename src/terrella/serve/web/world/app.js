@@ -5,9 +5,8 @@ import { FlatWorld } from './world.js';
 import { actionOf, encode, labelOf } from './action.js';
 
 const $ = (id) => document.getElementById(id);
-const about = JSON.parse($('about').textContent);
 const held = [];  // codes of the keys that are down, oldest first
-let world, state, paused = false, drawingSteps = about.network.steps, spent = 0, since = 0;
+let about, world, state, paused = false, drawingSteps, spent = 0, since = 0;
 
 /** The bytes of a script element that holds gzip in base64. */
 async function unpacked(id) {
@@ -44,7 +43,7 @@ function adapt(room) {
 
 function step() {
   const began = performance.now();
-  const { controls } = about.world, action = encode(controls, actionOf(controls.kind, about.rest, about.keys, held));
+  const { controls } = about.world, action = encode(controls, actionOf(controls, about.rest, about.keys, held));
   state = world.step(state, action, normal(3 * world.pixels), drawingSteps);
   show();
   const took = performance.now() - began;
@@ -87,7 +86,7 @@ function drawButtons() {
   for (const [row, codes] of actions) {
     const button = Object.assign(document.createElement('button'), { type: 'button' });
     button.dataset.codes = codes.join(' ');
-    button.append(...codes.map((code) => Object.assign(document.createElement('kbd'), { textContent: labelOf(code) })), about.names[row] ?? '');
+    button.append(...codes.map((code) => Object.assign(document.createElement('kbd'), { textContent: labelOf(code) })), about.names[codes[0]] ?? '');
     button.addEventListener('pointerdown', (event) => { button.setPointerCapture(event.pointerId); press(codes[0], true); });
     for (const kind of ['pointerup', 'pointercancel', 'lostpointercapture']) button.addEventListener(kind, () => press(codes[0], false));
     $('keys').append(button);
@@ -95,6 +94,8 @@ function drawButtons() {
 }
 
 async function begin() {
+  about = JSON.parse($('about').textContent);
+  drawingSteps = about.network.steps;
   const [kernels, weights, bytes] = await Promise.all(['kernels', 'weights', 'bytes'].map(unpacked));
   const { instance } = await WebAssembly.instantiate(kernels);
   world = new FlatWorld(new Network(instance.exports, about.network, new Uint16Array(weights.buffer)), about.world, bytes);
@@ -103,7 +104,7 @@ async function begin() {
   drawButtons();
   restart();
   document.body.dataset.state = 'playing';
-  window.terrella = { world, press, action: () => actionOf(about.world.controls.kind, about.rest, about.keys, held), get state() { return state; } };
+  window.terrella = { world, press, action: () => actionOf(about.world.controls, about.rest, about.keys, held), get state() { return state; } };
   addEventListener('keydown', (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.code === 'KeyR' && !about.keys.KeyR) return restart();
@@ -115,10 +116,10 @@ async function begin() {
   addEventListener('blur', () => [...held].forEach((code) => press(code, false)));
   $('restart').addEventListener('click', restart);
   $('pause').addEventListener('click', () => pause(!paused));
-  loop();
+  await loop();
 }
 
 begin().catch((error) => {
   document.body.dataset.state = 'failed';
-  $('pace').textContent = `This browser cannot run it (${error.message}): it needs WebAssembly with SIMD, as browsers since 2023 have.`;
+  $('pace').textContent = `It stopped (${error.message}). It needs WebAssembly with SIMD, as browsers since 2023 have.`;
 });
