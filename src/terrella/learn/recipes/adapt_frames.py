@@ -22,8 +22,8 @@ from ..recording import Recording, open_views
 from ..trainer import Report
 from .video import train_video
 from .video_config import TrainConfig
-from .video_flat import FlowBeginning
-from .video_posed import PosedBeginning, places_of
+from .video_parts import Continued
+from .video_posed import places_of
 
 HORIZONS = 1, 8, 16  # steps after which errors are measured
 ROLLOUTS, AT_ONCE = 32, 8  # of held-out frames
@@ -54,7 +54,7 @@ def adapt_frames(
         return {name: frame_errors(of[name], recording) for name, recording in recordings.items()}
 
     before = errors(new=_placed(world, recordings["new"]) if places else world, old=world)
-    begin = PosedBeginning(world, kept) if places else FlowBeginning(world, kept)
+    begin = Continued(world, kept)
     facts = train_video(data, out, settings, report, begin=begin)
     adapted = load_world(facts["world"])
     after = errors(new=adapted, old=adapted.replaced(scene=world.scene) if places else adapted)

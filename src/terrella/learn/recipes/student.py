@@ -18,7 +18,8 @@ from ..trainer import Paced, Report
 from .adapt_frames import settings_of
 from .video import train_video
 from .video_config import TrainConfig
-from .video_flat import FlowBeginning, network_of
+from .video_flat import network_of
+from .video_parts import Continued
 
 TEACHING = 0.5  # weight of what the teacher draws, against the recorded frames
 
@@ -53,7 +54,7 @@ def train_student(
         )
     settings = replace(settings, channels=widths)
     open_paired(teacher, data, None, report)  # refuses another game
-    begin = FlowBeginning(teacher, teaching=teaching)
+    begin = Continued(teacher, teaching=teaching)
     facts = train_video(data, out, settings, report, paced, say, begin)
     pair = {"student": replace(large, channels=widths, steps=settings.flow_steps), "teacher": large}
     return facts | {"gflop_per_frame": {name: gflop_per_frame(FlowNetwork(config)) for name, config in pair.items()}}

@@ -27,9 +27,9 @@ from ..strips import draw_strip
 from ..trainer import Paced, Report, Run, Trainer
 from .parts import SensesConfig, learn_senses
 from .video_config import TrainConfig, video_config
-from .video_flat import FlowBeginning, FlowRecipe
-from .video_parts import VideoRecipe
-from .video_posed import PosedBeginning, PosedRecipe
+from .video_flat import FlowRecipe
+from .video_parts import Continued, VideoRecipe
+from .video_posed import PosedRecipe
 
 FEWEST_FRAMES = 200  # from which an uncertainty is learned
 WHY = "a world is learned from frames and actions (`terrella train latent-actions` finds actions where there are none)"
@@ -42,7 +42,7 @@ def train_video(
     report: Report,
     paced: Paced | None = None,
     say: Callable[[str], object] = lambda line: None,
-    begin: FlowBeginning | PosedBeginning | None = None,
+    begin: Continued | None = None,
     meanwhile: Path | None = None,
 ) -> dict:
     """Trains, or resumes, the run in `out`; the finished world is in `out`/world. Returns the facts of the run. `paced` as in
@@ -93,7 +93,7 @@ def _recipe(
     config: TrainConfig,
     report: Report,
     minutes: float | None = None,
-    begin: FlowBeginning | PosedBeginning | None = None,
+    begin: Continued | None = None,
     meanwhile: Path | None = None,
 ) -> VideoRecipe:
     """What is learned from the recording, by a preset for `minutes`, by default those of the settings. TrainingError or
@@ -119,9 +119,7 @@ def _recipe(
     torch.manual_seed(config.seed)
     video = video_config(recording, config)
     if video.geometry:
-        assert not isinstance(begin, FlowBeginning)
         return PosedRecipe(run, recording, config, video, plan, begin)
-    assert not isinstance(begin, PosedBeginning)
     return FlowRecipe(run, recording, config, video, plan, begin, meanwhile)
 
 

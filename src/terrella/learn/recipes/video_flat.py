@@ -1,7 +1,7 @@
 """Worlds of frames alone: recordings without depth or poses. Stages: scroll, outcome, then a flow network."""
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ from ..sized_feed import Feed
 from ..subcloning import subclone
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
-from .video_parts import VideoParts
+from .video_parts import Continued, VideoParts
 
 PAIR_PIXELS = 1 << 20  # pixels of the pairs of frames in which moves are searched, in QUARTER hours or more
 QUARTER = 0.25
@@ -45,17 +45,6 @@ APART, WHOLE = 16, 0.3  # steps, and the share of pixels that differ where pictu
 REMEMBERED = 64  # steps before a start from which its mosaic is made
 CHANGED_SHARE = 0.4  # the pixels that change weigh this share of all others in the loss,
 MAX_STRESS = 16.0  # but each at most this much: with 128, long trainings get worse
-
-
-@dataclass(frozen=True)
-class FlowBeginning:
-    """What a training continues: a finished world of frames alone, and a recording of what it learned before, if there is one.
-    teaching: 0 for the world's own network, which learns on; above, a new network learns, with this weight, what the world draws,
-    and the recorded frames with the rest."""
-
-    world: LearnedWorld
-    kept: Recording | None = None
-    teaching: float = 0.0
 
 
 class FlowRecipe:
@@ -69,7 +58,7 @@ class FlowRecipe:
         config: TrainConfig,
         video: VideoConfig,
         plan: TrainingPlan,
-        begin: FlowBeginning | None = None,
+        begin: Continued | None = None,
         meanwhile: Path | None = None,
     ):
         """meanwhile: the folder of a recording that may grow while training has begun."""

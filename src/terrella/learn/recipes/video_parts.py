@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +23,17 @@ from ..recording import Recording
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
+
+
+@dataclass(frozen=True)
+class Continued:
+    """What a training continues: a finished world, and a recording of what it learned before, to rehearse, if there is one.
+    teaching: 0 for the world's own network, which learns on; above, for a world of frames alone, a new network learns, with this
+    weight, what the world draws, and the recorded frames with the rest."""
+
+    world: LearnedWorld
+    kept: Recording | None = None
+    teaching: float = 0.0
 
 
 class VideoRecipe(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -29,18 +29,10 @@ from ..recording import Recording, choose_keyframes, open_views
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
-from .video_parts import VideoParts
+from .video_parts import Continued, VideoParts
 
 KEPT_EVERY = 4  # batches, of which one rehearses
 Part = TypeVar("Part", bound=nn.Module)
-
-
-@dataclass(frozen=True)
-class PosedBeginning:
-    """What a training continues: a finished world of places, and a recording of its places to rehearse, if there is one."""
-
-    world: LearnedWorld
-    kept: Recording | None = None
 
 
 class PosedRecipe:
@@ -54,7 +46,7 @@ class PosedRecipe:
         config: TrainConfig,
         video: VideoConfig,
         plan: TrainingPlan,
-        begin: PosedBeginning | None = None,
+        begin: Continued | None = None,
     ):
         self.begin = begin
         if begin is not None:
