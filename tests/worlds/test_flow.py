@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from terrella.core import check_world, make_rng
+from terrella.core import check_world, make_rng, precision
 from terrella.core.errors import CheckpointError
 from terrella.data import Layout
 from terrella.space.ground import window
@@ -117,10 +117,14 @@ def test_the_draft_is_the_same_whatever_the_noise_and_a_sample_is_not():
     assert torch.equal(*drafts) and not torch.allclose(*samples, atol=0.01)
 
 
-def test_each_of_a_batch_is_drawn_alone():
+@pytest.mark.parametrize(("half", "apart"), [(False, 1e-4), (True, 0.03)])
+def test_each_of_a_batch_is_drawn_alone(monkeypatch, half, apart):
+    """Up to half precision, where a CPU has it."""
+    monkeypatch.setattr(precision, "half_is_native", lambda device: half)
     made, given, chance = network(), shown(18), noise(18, 0)
-    whole = made.draw(chance, given)
-    torch.testing.assert_close(whole[17:], made.draw(chance[17:], given.at(slice(17, 18))), rtol=1e-4, atol=1e-4)
+    whole, alone = made.draw(chance, given)[17:], made.draw(chance[17:], given.at(slice(17, 18)))
+    torch.testing.assert_close(whole, alone, rtol=1e-4, atol=apart)
+    assert half == (not torch.allclose(whole, alone, rtol=1e-4, atol=1e-4))
 
 
 def scrolled() -> tuple[Conditioning, torch.Tensor, torch.Tensor]:

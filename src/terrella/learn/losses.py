@@ -4,9 +4,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from ..core.precision import half_precision
 from ..space.keyframes import Glimpse
 from .batches import Batch
-from .devices import half_precision
 from .learners import Learner
 
 

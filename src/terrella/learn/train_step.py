@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from ..core.precision import half_is_native, half_precision
 from ..core.world import make_rng
-from .devices import half_is_native, half_precision
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,10 @@ import torch
 from torch import nn
 
 from ..core.errors import TrainingError, is_out_of_memory, reason_of
+from ..core.precision import half_is_native
 from ..core.world import make_rng
 from .budget import Budget
-from .devices import half_is_native, yield_cores
+from .devices import yield_cores
 from .learners import Learner
 from .run_folder import check_run, load_run, resume_file, save_run, trim_log, write_log
 from .sized_feed import Feed, ResizableFeed

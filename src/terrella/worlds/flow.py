@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..core.backend import constant, plus
+from ..core.precision import half_precision
 from ..space.mosaic import displaced, read_mosaic
 from ..space.overlap import Blend, MountedCamera
 from ..space.recall import most_alike
@@ -184,7 +185,8 @@ class FlowNetwork(nn.Module):
         config.steps."""
         steps = steps or self.config.steps
         if parts := parts_of(noise):
-            return torch.cat([self.draw(noise[part], conditioning.at(part), steps) for part in parts])
+            with half_precision(noise.device):
+                return torch.cat([self.draw(noise[part], conditioning.at(part), steps) for part in parts])
         mosaic, scroll, memory = conditioning.mosaic, conditioning.scroll, None
         if mosaic is not None and scroll is not None:
             memory = read_mosaic(mosaic, self.config.size, self.moves[scroll]).masked_fill(self.over, 0)

@@ -7,9 +7,9 @@ from collections.abc import Generator as Generating
 import numpy as np
 import torch
 
+from ...core.precision import half_precision
 from ...worlds.generator import Conditioning, UNet
 from ..batches import Batch, generate_now
-from ..devices import half_precision
 from ..learners import Ema, Learner, adamw
 from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, truth_losses, weighted_total
 from ..train_step import TrainStep
