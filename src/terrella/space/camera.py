@@ -134,6 +134,20 @@ def yaw(pose: torch.Tensor) -> torch.Tensor:
     )
 
 
+def turn_between(pose: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+    """The angle in radians, 0 or more, between the heading of `pose` [B, 7] and those of `others` [B, n, 7]: [B, n]."""
+    facing, ahead, turned = (constant(part.to, pose.device, pose.dtype) for part in (_HEADING, _AHEAD, _RELATIVE))
+    products = _products(torch.cat([pose[:, None], others], 1))
+    headings = torch.addmm(ahead, products.view(-1, 16), facing).view(*products.shape[:-1], 2)
+    sides = headings[:, 1:] @ (headings[:, 0] @ turned).view(-1, 2, 2)  # sine and cosine of the angle
+    return torch.atan2(*sides.unbind(-1)).abs()
+
+
+_RELATIVE = torch.tensor(
+    [[0.0, 1.0, -1.0, 0.0], [1.0, 0.0, 0.0, 1.0]]
+)  # a sine and cosine to the matrix that turns back by it
+
+
 def tilted_pose(
     x: torch.Tensor, y: torch.Tensor, z: torch.Tensor, heading: torch.Tensor, pitch: torch.Tensor
 ) -> torch.Tensor:

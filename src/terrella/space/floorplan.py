@@ -2,12 +2,11 @@
 body is an axis-aligned upright box, as in Doom and Quake."""
 
 import math
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 
-from ..core.backend import constant, kernels_do, where
+from ..core.backend import constant, kernels_do, plus, where
 from .camera import Intrinsics, unproject, yaw
 from .kernels_numba.walls import WITHIN_M
 from .kernels_numba.walls import slide as slide_kernel
@@ -31,13 +30,15 @@ def wall_segments(depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics) -
     On the horizon the inverse depth of a flat wall is linear in the column; runs that meet are extended to their corner. Walls
     farther than SEEN_M, or so far that neighbouring columns are half a metre apart, are left out."""
     row, lens = depth[:, horizon(camera, depth.shape[-2])], (camera[0], camera[2])
-    inverse = row.masked_fill(row <= 0, 1e3).double().clamp(0.05, 1e3).reciprocal()
+    inverse = constant(_doubles, depth.device, 1.0) / F.threshold(row, 0.0, 1e3).clamp(0.05, 1e3)
     runs = straight_runs(inverse, *lens)
-    spans = F.pad(inverse.cumsum(1), (1, 0)).gather(1, runs[..., :2].long().flatten(1)).view_as(runs[..., :2])
-    long, whole = runs[..., :2].diff(dim=2)[..., 0], spans.diff(dim=2)[..., 0]
-    known = (long >= FEWEST_FAR) | (whole * NEARBY_M > long)
+    edges = torch.add(
+        constant(_ends, depth.device, depth.shape[-1], *lens), runs[..., :2], alpha=-1 / (depth.shape[-1] * lens[0])
+    )
+    long, middle = runs[..., :2].diff(dim=2)[..., 0], edges.mean(2)
+    known = (long >= FEWEST_FAR) | (torch.addcmul(runs[..., 3], runs[..., 2], middle) > 1 / NEARBY_M)
     most, order = (long * known).sort(dim=1, descending=True, stable=True)
-    lines = torch.cat([_corners(runs, depth.shape[-1], *lens), runs[..., 2:]], 2)
+    lines = torch.cat([_corners(runs, edges, 1 / (depth.shape[-1] * lens[0])), runs[..., 2:]], 2)
     sides, slope, level = lines.gather(1, order[..., None].expand(-1, -1, 4)).split([2, 1, 1], 2)
     ahead = torch.addcmul(level, slope, sides).reciprocal()
     turn = (yaw(pose)[:, None] + constant(_doubles, depth.device, *_TURNED)).cos().view(-1, 2, 2)
@@ -70,24 +71,26 @@ def straight_runs_slowly(inverse: torch.Tensor, focal: float, middle: float) -> 
     columns, onward, long = (constant(torch.arange, device, first, first + width) for first in (0, 1, FEWEST))
     given = device, width, focal, middle
     beside = constant(_beside, *given)
-    near = inverse.reciprocal().masked_fill(inverse < 1 / SEEN_M, torch.inf)
+    near = F.threshold(inverse, 1 / SEEN_M, 0.0).reciprocal()
     joins = torch.linalg.vector_norm((near[:, None] * beside).diff(dim=2), dim=1) <= GAP_M
     # [K, first, last] of runs from column `first` to column `last`
     values = inverse[:, None] * beside
     sums = values.cumsum(2)
     sums = sums[:, :, None] - (sums - values)[..., None]  # over runs: [K, 2, first, last]
     lines = (constant(_lines, *given) * sums[:, None]).sum(2).flatten(2).mT
-    off = torch.baddbmm(inverse[:, None], lines, beside.expand(count, -1, -1), beta=-1).view(count, width, width, width)
+    beside, scale = beside.expand(count, -1, -1), 1 / STRAIGHT
+    off = torch.baddbmm(inverse[:, None], lines, beside, beta=-scale, alpha=scale).view(count, width, width, width)
     off = torch.linalg.vector_norm(off.masked_fill(constant(_outside, device, width), 0.0), torch.inf, dim=3)
     most = inverse[:, None].expand(-1, width, -1).triu().cummax(2).values
     broken = constant(_after, device, width) > F.pad(joins, (1, 0), value=True)[:, None]
-    stop = where((off > STRAIGHT * most) | broken, columns, width).amin(2)
+    stop = where((off > most) | broken, columns, width).amin(2)
     lines = lines.view(count, width, width, 2).gather(2, (stop - 1)[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
     wide = stop >= long
-    # which columns a walk from the left comes to: how many ways of steps and stays lead there in 2 ** n moves
+    # which columns a walk from the left comes to: the first, and those to which another one leads
     leads = torch.where(wide, stop, onward)[..., None] == columns
-    moves = torch.where(leads, constant(_doubles, device, 1.0), constant(_stay, device, width))
-    taken = wide & (torch.linalg.matrix_power(moves, 1 << (width - 1).bit_length())[:, 0] > 0)
+    begin, stay = constant(_stay, device, width)[None, :1].expand(count, -1, -1), constant(_stay, device, width)
+    walk = torch.where(leads, constant(_doubles, device, -1.0), stay)
+    taken = wide & (torch.linalg.solve_triangular(walk, begin, upper=True, left=False, unitriangular=True)[:, 0] > 0)
     order = where(taken, columns, width).argsort(dim=1)
     runs = torch.cat([columns.expand(count, -1)[..., None], stop[..., None], lines], 2) * taken[..., None]
     return runs.gather(1, order[:, : width // FEWEST, None].expand(-1, -1, 4))
@@ -130,11 +133,10 @@ def _stay(width: int) -> torch.Tensor:
     return torch.eye(width, dtype=torch.float64)
 
 
-def _corners(runs: torch.Tensor, width: int, focal: float, middle: float) -> torch.Tensor:
-    """Both ends [K, n, 2] of runs [K, n, 4], as `columns_left`: their outer columns, or the corner with a neighbour that they
-    meet."""
-    column, ends = -1 / (width * focal), constant(_ends, runs.device, width, focal, middle)
-    ends = torch.add(ends, runs[..., :2], alpha=column).flatten(1)
+def _corners(runs: torch.Tensor, ends: torch.Tensor, column: float) -> torch.Tensor:
+    """Both ends [K, n, 2] of runs [K, n, 4], as `columns_left`: their outer columns, `ends` [K, n, 2], or the corner with a
+    neighbour that they meet. column: what one looks farther to the left than the next."""
+    ends = ends.flatten(1)
     edges = ends[:, 1:-1].unflatten(1, (-1, 2))  # where one ends, and the next begins
     lines = runs[..., 2:].diff(dim=1)
     corner = -(lines[..., 1] / lines[..., 0])
@@ -142,7 +144,7 @@ def _corners(runs: torch.Tensor, width: int, focal: float, middle: float) -> tor
     places = torch.stack([corner[..., None].expand_as(edges), edges])
     ahead = torch.addcmul(level, slope, places).reciprocal()
     apart = torch.hypot(*(part.diff(dim=0)[0] for part in (ahead, ahead * places))).amax(2)
-    inside = corner == torch.clamp(corner, edges[..., 1] + column, edges[..., 0] - column)
+    inside = corner == torch.clamp(corner, edges[..., 1] - column, edges[..., 0] + column)
     meet = (runs[:, 1:, 0] - runs[:, :-1, 1] <= 2) & inside & (apart < GAP_M)
     met = torch.where(meet[..., None], corner[..., None], edges).flatten(1)
     return torch.cat([ends[:, :1], met, ends[:, -1:]], 1).unflatten(1, (-1, 2))
@@ -232,81 +234,73 @@ def slide_slowly(walls, places, wish, half_m, short, own) -> tuple[torch.Tensor,
     whole = torch.cat([walls.expand(len(places), -1, -1), own.to(walls)], 1)
     if not whole.shape[1]:
         return wish, wish
-    sides = _sides(whole.double(), half_m)
-    place, rest, free = places.double(), wish.double(), None
+    apart = whole.double().unflatten(2, (2, 2)) - places[:, None, None]
+    unit, marks, near = _sides(apart, half_m)
+    left = move = wish.double()
+    shift = torch.zeros_like(move)
     for bump in range(3):
-        share, along = _first_touch(sides, place, rest)
+        speed = (unit @ move[..., None]).view(near.shape[:3])
+        share, face = _first_touch(marks, speed, near)
         blocked = share <= 1
         go = where(blocked, (share - short).clamp_min(0), 1.0)
-        place = torch.addcmul(place, go if free is None else go * free, rest)
-        free = blocked if free is None else free & blocked
-        if bump < 2:
-            onward = (rest * along).sum(1, keepdim=True) * (1 - share).clamp_max(1) * along
-            rest = torch.where(free, onward, rest)
-        else:
-            rest = rest.masked_fill(free, 0.0)
-    return (place - places).to(wish), rest.to(wish)
+        shift = torch.addcmul(shift, go, move)
+        if bump == 2:
+            left = left.masked_fill(blocked, 0.0)
+            break
+        moves = go[..., None, None] * constant(_doubles, walls.device, *_MOVES)
+        marks = torch.addcmul(marks, speed[..., None], moves, value=-1)
+        normal = unit.gather(1, face[..., None].expand(-1, -1, 2))[:, 0]
+        along = torch.addcmul(move, normal, speed.flatten(1).gather(1, face), value=-1)
+        move = along * plus(1.0, share, -1).clamp(0, 1)  # nothing, where the whole move was free
+        left = torch.where(blocked, move, left)
+    return shift.to(wish), left.to(wish)
 
 
-class _Sides(NamedTuple):
-    """Walls [B, S] by their separating axes x, y and across: the axes [B, 3 S, 2]; the direction along each [B, 3 S, 2]; how far
-    along each lie the ends of a wall that is a body's half width larger [B, S, 3, 2], nan for no wall, and their middles [B, S, 3];
-    how near to these a box that touches by one axis has to be, seen along another, so that it does not only graze the wall
-    [B, S, 3, 3]."""
-
-    unit: torch.Tensor
-    onward: torch.Tensor
-    ends: torch.Tensor
-    middle: torch.Tensor
-    near: torch.Tensor
-
-
-def _sides(walls: torch.Tensor, half: float) -> _Sides:
-    """Of walls [B, S, 4]."""
-    ends = walls.unflatten(-1, (2, 2))
-    along = ends[..., 1, :] - ends[..., 0, :]
-    length = torch.linalg.vector_norm(along, dim=-1, keepdim=True)
-    turn, plain, sides = (constant(_doubles, walls.device, *rows) for rows in (_QUARTER, _PLAIN, ((-1.0, 1.0),)))
-    across = (along @ turn) / length.masked_fill(length < 1e-9, torch.nan)
+def _sides(walls: torch.Tensor, half: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Walls [B, S, 2 ends, 2], seen from a body, by their separating axes x, y and across: the axes [B, 3 S, 2]; `marks`
+    [B, S, 3, 5] along each, of a wall that is a body's half width larger: both ends, WITHIN_M before and after the body, and the
+    middle, nan for no wall; and how near to that middle a box that touches by one axis has to be, seen along another, so that it
+    does not only graze the wall [B, S, 3, 3]."""
+    turn, plain, mix, box, *columns = (
+        constant(_doubles, walls.device, *rows)
+        for rows in (_QUARTER, _PLAIN, _MIX, ((half - 1e-9, 0.0), (0.0, half - 1e-9)), *_MARKS)
+    )  # a box that moves along a wall that it touches does not run into it, hence 1e-9
+    spans = mix @ walls  # middle, and half of the way from end to end
+    along = spans[:, :, 1]
+    across = (along @ turn) / torch.linalg.vector_norm(along, dim=-1, keepdim=True)
     unit = torch.cat([plain.expand(*along.shape[:2], 2, 2), across[..., None, :]], 2)
-    onward = unit @ turn.mT
-    both = unit @ ends.mT  # [B, S, 3 axes, 2 ends]
-    reach = torch.add(both.diff(dim=-1)[..., 0].abs(), torch.linalg.vector_norm(unit, 1, dim=-1), alpha=2 * half) / 2
-    middle = both.mean(-1)
-    grazing = (unit @ onward.mT).abs() > 0.02
-    near = where(grazing, (reach - WITHIN_M)[:, :, None].expand(grazing.shape), torch.inf)
-    # a box that moves along a wall that it touches does not run into it
-    ends = torch.addcmul(middle[..., None], (reach - 1e-9)[..., None], sides[0])
-    return _Sides(unit.flatten(1, 2), onward.flatten(1, 2), ends, middle, near)
+    seen = unit @ torch.cat([spans, box.expand(*along.shape[:2], 2, 2)], 2).mT  # [B, S, 3 axes, 4]
+    middle, reach = seen[..., :1], torch.linalg.vector_norm(seen[..., 1:], 1, dim=-1, keepdim=True)
+    marks = torch.addcmul(torch.addcmul(columns[0], middle, columns[1]), reach, columns[2])
+    grazing = (unit @ turn @ unit.mT).abs() > 0.02
+    near = where(grazing, (reach - WITHIN_M).mT.expand(grazing.shape), torch.inf)
+    return unit.flatten(1, 2), marks, near
 
 
 _QUARTER = (0.0, -1.0), (1.0, 0.0)
 _PLAIN = (1.0, 0.0), (0.0, 1.0)
+_MIX = (0.5, 0.5), (-0.5, 0.5)
+# the marks are the first row, plus the middle by the second and the reach by the third; a body's move shifts those of the wall
+_MARKS = ((0.0, 0.0, -WITHIN_M, WITHIN_M, 0.0),), ((1.0, 1.0, 0.0, 0.0, 1.0),), ((-1.0, 1.0, 0.0, 0.0, 0.0),)
+_MOVES = _MARKS[1]
 
 
 def _doubles(*rows) -> torch.Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _firsts(count: int) -> torch.Tensor:
-    return 3 * torch.arange(count)
-
-
-def _first_touch(sides: _Sides, place: torch.Tensor, move: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The share [B, 1] of the move [B, 2] at which a box at `place` [B, 2] first touches a wall (more than 1: none), and the
-    direction [B, 2] in which it can go on: see kernels_numba/walls.first_touch."""
-    unit, onward, ends, middle, near = sides
-    at, speed = (unit @ torch.stack([place, move], -1)).view(*middle.shape, 2).unbind(-1)  # [B, S, 3]
+def _first_touch(marks: torch.Tensor, speed: torch.Tensor, near: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The share [B, 1] of a move at which a box first touches a wall (more than 1: none), and the axis [B, 1] by which, of 3 S:
+    see kernels_numba/walls.first_touch. speed [B, S, 3]: the move along the axes; marks and near as of `_sides`."""
     # times from end to end along each axis; along one without speed always, or never
-    least, most = torch.aminmax((ends - at[..., None]) / speed[..., None], dim=-1)
-    enter, face = least.max(-1)
-    index = face[..., None]
-    off = torch.addcmul(middle - at, enter[..., None], speed, value=-1).abs()
-    clear = (off <= near.gather(2, index[..., None].expand(-1, -1, 1, 3))[:, :, 0]).all(-1)
-    reaches = (enter < most.amin(-1)) & (enter * speed.abs().gather(2, index)[..., 0] > -WITHIN_M) & clear
-    share, which = where(reaches, enter, 2.0).min(1, keepdim=True)
-    faced = (face + constant(_firsts, place.device, face.shape[1])).gather(1, which)
-    return share, onward.gather(1, faced[..., None].expand(-1, -1, 2))[:, 0]
+    first, last = torch.aminmax(marks[..., :4].unflatten(3, (2, 2)) / speed[..., None, None], dim=-1)
+    times, within = first.unbind(-1)
+    enter = times.amax(-1, keepdim=True)
+    off = torch.addcmul(marks[..., 4], enter, speed, value=-1).abs()
+    # by the axis on which the box enters last, before it leaves any, and not from deeper inside
+    enters = (times >= torch.maximum(enter, within)) & (times < last[..., 0].amin(-1, keepdim=True))
+    reaches = enters & (off[:, :, None] <= near).all(-1)
+    return where(reaches, times, 2.0).flatten(1).min(1, keepdim=True)
 
 
 def horizon(camera: Intrinsics, height: int) -> int:

@@ -200,9 +200,9 @@ def vote_slowly(
     if distance is None:
         distance = ahead.unflatten(2, (rows.shape[1], -1)).diagonal(dim1=1, dim2=2).mT.flatten(1)
     seen = inside & (distance < FAR_M)[:, None]
-    same = seen & ((held - ahead).abs() < SAME * ahead)
-    ratio = distance[:, None] / ahead.clamp_min(NEAR_M)
-    return torch.minimum(ratio, ratio.reciprocal()) * same
+    ratio, near, distance = held / ahead, ahead.clamp_min(NEAR_M), distance[:, None]
+    same = seen & (ratio.clamp(1 - SAME, 1 + SAME) == ratio)
+    return torch.minimum(distance, near) / torch.maximum(distance, near) * same
 
 
 def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
@@ -210,14 +210,19 @@ def pick_slowly(votes: torch.Tensor, count: int) -> torch.Tensor:
     if not votes.shape[1]:
         return torch.full((len(votes), count), -1, device=votes.device)
     votes = torch.cat([votes, ANYWAY * votes.amax(2, keepdim=True)], 2)
-    more, gains, picks = votes.relu(), [], []  # what each would add to the votes of those before it
+    best, picks = votes, []  # the best votes of each with those before it
+    sums = [constant(_nothing, votes.device).expand(len(votes), -1)]
     for number in range(count):
-        gain, chosen = more.sum(2).max(1, keepdim=True)
-        gains.append(gain)
+        most, chosen = best.sum(2, dtype=torch.float64).max(1, keepdim=True)
+        sums.append(most)
         picks.append(chosen)
         if number + 1 < count:
-            more = (more - more.gather(1, chosen[..., None].expand(-1, -1, more.shape[2]))).relu()
-    return torch.cat(picks, 1).masked_fill(torch.cat(gains, 1) <= 0, -1)
+            best = torch.maximum(best, best.gather(1, chosen[..., None].expand(-1, -1, best.shape[2])))
+    return torch.cat(picks, 1).masked_fill(torch.cat(sums, 1).diff(dim=1) <= 0, -1)
+
+
+def _nothing() -> torch.Tensor:
+    return torch.zeros(1, dtype=torch.float64)
 
 
 # -- what they show ---------------------------------------------------------------------------------------------------
@@ -281,8 +286,11 @@ def look_slowly(
     def chosen(own_part: torch.Tensor, first: torch.Tensor) -> torch.Tensor:
         return torch.where(mine.view(*mine.shape, *[1] * (first.ndim - 1)), own_part, first[theirs])
 
-    key_depth, poses, turns, rgb = both("depth"), both("pose"), both("turn"), both("rgb", doubled) / 255
-    patch, turn = patches_slowly(key_depth, poses, camera, FINE, turns), rotation(pose)
+    key_depth, poses, rgb, keys = both("depth"), both("pose"), both("rgb", doubled) / 255, picks.shape[1]
+    viewers = [poses, pose[:, None]] if last is None else [poses, last[2][:, None], pose[:, None]]
+    viewers = torch.cat(viewers, 1)
+    turns = rotation(viewers)
+    patch, turn = patches_slowly(key_depth, poses, camera, FINE, turns[:, :keys]), turns[:, -1]
     if len(shared):
         patch = chosen(patch, shared.fine)
     patch = patch * valid[..., None, None]
@@ -290,12 +298,11 @@ def look_slowly(
     hit = depth < FAR_M
     depth = fill_holes(depth)
     if last is not None:  # as one keyframe more, whose colours are taken apart
-        key_depth, poses = (torch.cat([one, other[:, None]], 1) for one, other in zip((key_depth, poses), last[1:]))
-        turns = torch.cat([turns, rotation(last[2])[:, None]], 1)
-    places, agreement, near = sight(key_depth, poses, turns, depth, (pose, turn), camera)
-    keys = picks.shape[1]
-    shown = colours_at(rgb, places[:, :keys]), agreement[:, :keys], depth[:, None] / near[:, :keys]
-    colours, trust = best_slowly(*shown, valid, slots)
+        key_depth = torch.cat([key_depth, last[1][:, None]], 1)
+    places, agreement, near = sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera)
+    depths = depth[:, None], near[:, :keys]
+    likeness = torch.minimum(*depths) / torch.maximum(*depths)
+    colours, trust = best_slowly(colours_at(rgb, places[:, :keys]), agreement[:, :keys], likeness, valid, slots)
     glimpse = Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
     if last is None:
         return glimpse, None
@@ -303,11 +310,10 @@ def look_slowly(
     return glimpse, unknown_alone(colour, trust, glimpse.known)
 
 
-def best_slowly(colour, agreement, closeness, valid, slots) -> tuple[torch.Tensor, torch.Tensor]:
-    """The most trusted colours [B, slots, 3, H, W] and their trust [B, slots, H, W], of what S keyframes show: as `warp` gives it,
-    `valid` [B, S]."""
-    likeness = torch.minimum(closeness, closeness.clamp_min(1e-3).reciprocal()).clamp_min(0.05)
-    sure = where(valid[..., None, None], agreement * likeness.square(), -1.0)
+def best_slowly(colour, agreement, likeness, valid, slots) -> tuple[torch.Tensor, torch.Tensor]:
+    """The most trusted colours [B, slots, 3, H, W] and their trust [B, slots, H, W], of what S keyframes show: colour and
+    agreement as `warp` gives them, likeness: the smaller distance over the larger, `valid` [B, S]."""
+    sure = where(valid[..., None, None], agreement * likeness.clamp_min(0.05).square(), -1.0)
     # of equals the first, as the kernel does
     best, order = (part[:, :slots] for part in sure.sort(dim=1, descending=True, stable=True))
     colours = colour.gather(1, order[:, :, None].expand(-1, -1, 3, -1, -1)) * (best >= 0)[:, :, None]

@@ -13,7 +13,7 @@ from ..core.arena import Arena
 from ..core.backend import constant, kernels_do, where
 from ..core.errors import ContractError
 from ..core.state import State
-from .camera import Intrinsics, yaw
+from .camera import Intrinsics, turn_between, yaw
 from .floorplan import NOWHERE, WALLS
 from .kernels_numba import recall as kernels
 from .keyframes import COARSE, Glimpse, Keyframes, RgbdFrame, look_and_carry, retrieve, vote_slowly
@@ -132,12 +132,11 @@ class Memory:
     def nearest(self, held: Held, pose: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The distance [B] from `pose` [B, 7] to the nearest keyframe, above 1 for a new view, and that keyframe's slot [B]."""
         far, turn = self.new_view
-        here, kept = pose[:, None], held["memory_pose"]
-        away = (kept[..., :3] - here[..., :3]).norm(dim=-1) / far
-        headings = yaw(torch.cat([here, kept], 1))
-        angle = headings[:, 1:] - headings[:, :1]
-        apart = away + torch.atan2(angle.sin(), angle.cos()).abs() / turn
-        return where(held["memory_kind"] > EMPTY, apart, torch.inf).min(1)
+        kept = held["memory_pose"]
+        away = torch.linalg.vector_norm(kept[..., :3] - pose[:, None, :3], dim=-1)
+        away = torch.add(away, turn_between(pose, kept), alpha=far / turn)
+        least, slot = where(held["memory_kind"] > EMPTY, away, torch.inf).min(1)
+        return least / far, slot
 
     def _keep(self, held: Held, kind: int, rgb, depth, pose, which: torch.Tensor) -> dict[str, torch.Tensor]:
         if not self.capacity:

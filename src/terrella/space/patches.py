@@ -49,38 +49,39 @@ def patches_slowly(
     """The same as `patches`, in plain tensor algebra, also for GPUs; `turn` [..., 3, 3]: the rotations of the poses."""
     points, (height, width) = unproject(depth, pose, camera, turn), depth.shape[-2:]
     kept, images = (..., *[slice(stride // 2, None, stride)] * 2), depth.reshape(-1, height * width)
-    begin, end = (constant(_steps, depth.device, height, width, stride, step) for step in (0, 1))
-    lines = points.view(-1, height * width, 3)
-    steps = (lines[:, end] - lines[:, begin]).view(
-        *depth.shape[:-2], *begin.shape, 3
-    )  # [..., h, w, axis, before or after, 3]
+    ends = constant(_steps, depth.device, height, width, stride)
+    steps = points.view(-1, height * width, 3)[:, ends].diff(dim=1)
+    steps = steps.view(*depth.shape[:-2], *ends.shape[1:], 3)  # [..., h, w, axis, before or after, 3]
     long = torch.linalg.vector_norm(steps, dim=-1)
     sides = torch.where((long[..., 0] < long[..., 1])[..., None], steps[..., 0, :], steps[..., 1, :])
-    flat = _is_flat(images, height, width, stride).view(*depth.shape[:-2], *begin.shape[:2])
+    flat = _is_flat(images, height, width, stride).view(*depth.shape[:-2], *ends.shape[1:3])
     reach = where(flat, constant(torch.tensor, depth.device, 0.75 * stride), 0.5)
     reach = reach * (long.amin(-1).amax(-1) <= depth[kept] * (SLANT / (camera[0] * width)))
     whole = torch.cat([points[(*kept, slice(None))], (reach[..., None, None] * sides).flatten(-2)], -1)
     return whole.flatten(-3, -2)
 
 
-def _steps(height: int, width: int, stride: int, end: int) -> torch.Tensor:
-    """int64 [h, w, 2, 2]: the pixels from which (end = 0), or to which (1), the steps before and after a patch's pixel lead, to
-    the right and down. At a rim both are the one that there is."""
+def _steps(height: int, width: int, stride: int) -> torch.Tensor:
+    """int64 [2, h, w, 2, 2]: the pixels from which, and to which, the steps before and after a patch's pixel lead, to the right and
+    down. At a rim both are the one that there is."""
     first, before = stride // 2, torch.tensor([-1, 0])
     rows, columns = torch.arange(first, height, stride)[:, None, None], torch.arange(first, width, stride)[:, None]
-    right = rows * width + (columns + before).clamp(0, width - 2) + end
-    down = ((rows + before).clamp(0, height - 2) + end) * width + columns
-    return torch.stack([right, down], 2)
+    right = rows * width + (columns + before).clamp(0, width - 2)
+    down = (rows + before).clamp(0, height - 2) * width + columns
+    return torch.stack([torch.stack([right, down], 2), torch.stack([right + 1, down + width], 2)])
 
 
 def _is_flat(images: torch.Tensor, height: int, width: int, stride: int) -> torch.Tensor:
     """True where 1 / depth is a plane out to a patch's rim, as on any flat surface: of depth images [K, H W], bool [K, n] for each
     patch."""
-    around, middle = (constant(make, images.device, height, width, stride) for make in (_around, _middles))
-    inverse = images.clamp_min(NEAR_M).reciprocal()
-    images = inverse[:, middle]
-    bend = torch.sub(inverse[:, around].sum(1), images[:, None], alpha=2)
-    return torch.linalg.vector_norm(bend, torch.inf, dim=1) < 0.05 * images
+    inverse = images.clamp_min(NEAR_M).reciprocal()[:, constant(_around, images.device, height, width, stride)]
+    bend = constant(_bends, images.device) @ inverse
+    return torch.linalg.vector_norm(bend, torch.inf, dim=1) < inverse[:, -1]
+
+
+def _bends() -> torch.Tensor:
+    """[4, 9]: of what lies `_around`, opposite pixels less twice the middle, in shares of 0.05."""
+    return torch.cat([torch.eye(4), torch.eye(4), torch.full((4, 1), -2.0)], 1) / 0.05
 
 
 def _middles(height: int, width: int, stride: int) -> torch.Tensor:
@@ -90,11 +91,11 @@ def _middles(height: int, width: int, stride: int) -> torch.Tensor:
 
 
 def _around(height: int, width: int, stride: int) -> torch.Tensor:
-    """int64 [2, 4, n]: the pixels at the rims of patches, opposite ones in pairs; at the picture's rim its own."""
+    """int64 [9, n]: the four pixels at the rims of patches, the opposite ones, and the middle; at the picture's rim its own."""
     middles, rim = _middles(height, width, stride), max(1, round(0.75 * stride))
     steps = rim * torch.tensor([[0, 1], [1, 0], [1, 1], [1, -1]])[:, :, None]
-    ways = torch.stack([steps, -steps])
-    rows, columns = middles // width + ways[:, :, 0], middles % width + ways[:, :, 1]
+    ways = torch.cat([steps, -steps, 0 * steps[:1]])
+    rows, columns = middles // width + ways[:, 0], middles % width + ways[:, 1]
     return rows.clamp(0, height - 1) * width + columns.clamp(0, width - 1)
 
 
@@ -114,53 +115,69 @@ def cast(
     batch, count = patch.shape[:2]
     height, width = size
     taken, *ends_ = _pixels_of_camera(camera, size)
-    rays_, middle, limits = (constant(table, patch.device, *rows) for rows in (_ray_of_pixel(camera, size), *ends_))
+    middle, limits = (constant(table, patch.device, *rows) for rows in ends_)
     corners_of = constant(_corners_of_sides, patch.device, taken)  # one large product: a GPU does small ones one by one
+    edges_of, edges = (constant(make, patch.device, camera, size) for make in (_edges_of_normals, _edges))
     apart = patch - F.pad(pose[:, None, :3], (0, 6))
     turn = rotation(pose) if turn is None else turn
     sides = (apart.view(batch, -1, 3) @ turn).view(batch, count, 3, 3)  # centre, across, down
-    # a ray meets the plane at centre + s across + t down: the depth, s and t by Cramer's rule are ratios of such products
-    # with the ray of a pixel, which is linear in its column and row
-    one, other = (constant(torch.tensor, patch.device, order) for order in ((1, 0, 1), (2, 2, 0)))
-    normals = torch.linalg.cross(sides.index_select(2, one), sides.index_select(2, other))
-    products = normals @ rays_
+    one, other = sides.index_select(2, constant(torch.tensor, patch.device, (1, 0, 1, 2, 2, 0))).split(3, 2)
+    normals = torch.linalg.cross(one, other)
     lift = (normals[:, :, 0] * sides[:, :, 0]).sum(-1)
+    lines = torch.addcdiv(edges, normals.flatten(2) @ edges_of, lift[..., None])
     corners = (sides.flatten(2) @ corners_of).unflatten(2, (4, 5))
     places = torch.addcdiv(middle, corners[..., 1:], corners[..., :1].clamp_min(NEAR_M))
     ends = torch.maximum(places.amin(2).ceil(), limits)  # the first column and row, and minus those after the last
-    column, row, shape = ends[..., 0], ends[..., 1], -(ends[..., :2] + ends[..., 2:])
-    area = shape.clamp_min(0).prod(-1) * ((lift > 0) & (sides[:, :, 0, 0] > NEAR_M))
-    along = torch.addcmul(products[..., 0], products[..., 1], column[..., None])
-    anchored, start = torch.addcmul(along, products[..., 2], row[..., None]), torch.add(column, row, alpha=width)
-    single = [part[..., None] for part in (lift, start, shape[..., 0], area)]
-    boxes = torch.cat([anchored, products.flatten(2), *single], -1)
-    canvas = pose.new_full((batch, height * width + OUTSIDE), FAR_M)
+    shape = (ends @ constant(table, patch.device, *_SHAPE_OF_ENDS)).clamp_min(0)
+    shape = shape * ((lift > 0) & (sides[:, :, 0, 0] > NEAR_M))[..., None]
+    level, across, down = lines.split(EDGES, 2)
+    begin = torch.addcmul(torch.addcmul(level, across, ends[..., :1]), down, ends[..., 1:2])
+    boxes = torch.cat([begin[..., :-1], shape[..., 1:], lines[..., EDGES:], shape[..., :1]], -1)
+    canvas = pose.new_zeros(batch, height * width + OUTSIDE)
     steps = [(many * max(1, round(height * width / USUAL)), tried) for many, tried in steps]
     most = max((many for many, _ in steps if many < count), default=0)
-    largest = area.topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
+    largest = shape.prod(-1).topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
     for many, tried in steps:
         part = boxes if many >= count else boxes.gather(1, largest[:, :many])
-        _cast_boxes(part, width, min(tried, height * width), canvas)
-    return canvas[:, :-OUTSIDE].view(batch, height, width)
+        _cast_boxes(part, min(tried, height * width), canvas)
+    return canvas[:, :-OUTSIDE].reciprocal().clamp_max(FAR_M).view(batch, height, width)
 
 
-def _cast_boxes(boxes: torch.Tensor, width: int, pixels: int, canvas: torch.Tensor) -> None:
-    """Lowers `canvas` [B, H * W + OUTSIDE] at the first `pixels` pixels of the boxes [B, n, 16] of patches."""
+# Linear functions of a pixel: its number, 1 / depth of the plane there, then those that are above 0 in the patch and in its box.
+EDGES = 8
+
+
+def _cast_boxes(boxes: torch.Tensor, pixels: int, canvas: torch.Tensor) -> None:
+    """Raises `canvas` [B, H * W + OUTSIDE], 1 / depth, at the first `pixels` pixels of the boxes of patches [B, n, 3 EDGES + 1]:
+    the EDGES functions at the first pixel, what they gain by a column and by a row, and how wide the box is."""
     number = constant(torch.arange, boxes.device, float(pixels))
-    lift, start, wide, area = boxes[..., 12:].unsqueeze(3).unbind(2)
-    row = torch.div(number, wide, rounding_mode="floor")
-    column = torch.addcmul(number, row, wide, value=-1)
-    anchored, products = boxes[..., :3, None], boxes[..., 3:12].unflatten(2, (3, 3))[..., None]
-    along = torch.addcmul(anchored, products[:, :, :, 1], column[:, :, None])
-    ratios = torch.addcmul(along, products[:, :, :, 2], row[:, :, None])
-    far = lift / ratios[:, :, 0]
-    inside = torch.linalg.vector_norm(ratios[:, :, 1:], torch.inf, dim=2) <= ratios[:, :, 0]
-    hit = inside & (far > NEAR_M) & (number < area)
+    row = torch.div(number, boxes[..., -1:], rounding_mode="floor")
+    column = torch.addcmul(number, row, boxes[..., -1:], value=-1)
+    begin, across, down = boxes[..., :-1, None].split(EDGES, 2)
+    lines = torch.addcmul(torch.addcmul(begin, across, column[:, :, None]), down, row[:, :, None])
+    hit = lines[:, :, 2:].amin(2) > 0
     aside = constant(cells_outside, boxes.device, hit.shape[1] * pixels, float(canvas.shape[1])).view(hit.shape[1:])
-    pixel = torch.where(hit, torch.add(column, row, alpha=width) + start, aside).long()
-    canvas.scatter_reduce_(1, pixel.flatten(1), far.flatten(1), "amin")
+    pixel = torch.where(hit, lines[:, :, 0], aside).long()
+    canvas.scatter_reduce_(1, pixel.flatten(1), lines[:, :, 1].flatten(1), "amax")
 
 
+def _edges_of_normals(camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
+    """[9, 3 EDGES], by which three normals [9] are multiplied for the EDGES functions at the first pixel, and what they gain by a
+    column and by a row, times `lift`. A ray meets a plane at centre + s across + t down: by Cramer's rule lift / depth, and this
+    times s and t, are the products of the normals with it."""
+    ratios = torch.tensor([(0, 1, 1, 1, 1, 1, -1, 0), (0, 0, -1, 1, 0, 0, 0, 0), (0, 0, 0, 0, -1, 1, 0, 0)])
+    rays = table(*_ray_of_pixel(camera, size))
+    return (ratios[:, None, None] * rays[..., None]).reshape(9, 3 * EDGES)
+
+
+def _edges(camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:
+    """[3 EDGES], what is added to these: a pixel's number is column + width * row, the plane is not too near, and the row in the
+    box."""
+    level, across, down = (0.0,) * 6 + (1 / NEAR_M, 0.0), (1.0,) + (0.0,) * 7, (float(size[1]),) + (0.0,) * 6 + (-1.0,)
+    return table(*level, *across, *down)
+
+
+_SHAPE_OF_ENDS = (-1.0, 0.0), (0.0, -1.0), (-1.0, 0.0), (0.0, -1.0)
 _CORNERS = (1.0, 1.0, 1.0), (1.0, 1.0, -1.0), (1.0, -1.0, 1.0), (1.0, -1.0, -1.0)
 
 

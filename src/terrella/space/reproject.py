@@ -66,12 +66,13 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
 def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     """The same as `fill_holes`, in plain tensor algebra, also for GPUs and gradients."""
-    near = least_around_slowly(depth)
-    ratio = depth / near
-    count = F.avg_pool2d((ratio < 1.15)[:, None].float(), 3, 1, 1)[:, 0]
-    depth = torch.where((ratio > 1.3) & (count > 0.55), near, depth)[:, None]
-    inverse = depth.reciprocal()
-    stack = [torch.cat([inverse, torch.ones_like(inverse)], 1) * (depth < FAR_M)]
+    inverse = depth.reciprocal()[:, None]
+    near = F.max_pool2d(inverse, 3, 1, 1)
+    ratio = depth[:, None] * near
+    count = F.avg_pool2d((ratio < 1.15).float(), 3, 1, 1)
+    inverse = torch.where((ratio > 1.3) & (count > 0.55), near, inverse)
+    seen = inverse > 1.0001 / FAR_M  # a compiler may round divisions
+    stack = [torch.cat([inverse * seen, seen], 1)]
     for _ in range(levels):
         stack.append(F.avg_pool2d(stack[-1], 2, ceil_mode=True))
     sums, weights = torch.cat([both.flatten(2) for both in stack], 2).split(1, 1)  # of all levels at once

@@ -17,7 +17,7 @@ from ..core.backend import kernels_do
 from ..core.errors import ObservationError
 from ..core.spec import PLACES_UNIT
 from ..core.state import State
-from ..space.camera import Intrinsics, yaw
+from ..space.camera import Intrinsics, turn_between
 from ..space.floorplan import floor_plan
 from ..space.keyframes import Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table
@@ -229,9 +229,8 @@ class KeyframeScene:
         """How well the place is known [B, 2]: distance to the nearest recorded keyframe, log(1 + metres), a radian counting as
         two metres; and the share of its own memory that is in use."""
         pose, kept = state["pose"], self.recorded.pose
-        angle = (self._table[:, 2] - yaw(pose)[:, None] + torch.pi) % (2 * torch.pi) - torch.pi
         apart = torch.cdist(pose[:, :3], kept[:, :3], compute_mode=EXACTLY)
-        apart = torch.add(apart, angle.abs(), alpha=2)
+        apart = torch.add(apart, turn_between(pose, kept.expand(len(pose), -1, -1)), alpha=2)
         nearest = apart.amin(1).clamp_max(20) if len(kept) else pose.new_full((len(pose),), 20.0)
         own = self.own.count(state) / max(1, self.own.capacity)
         return torch.stack([nearest.log1p(), own], 1)
@@ -267,7 +266,7 @@ class KeyframeScene:
 
 def _cell_codes(places: torch.Tensor) -> torch.Tensor:
     """Codes int64 [N] of the map's cells in which places [N, 2] lie."""
-    column, row = (places / CELL_M).floor().clamp(-(2**30), 2**30).long().unbind(-1)
+    column, row = torch.div(places, CELL_M, rounding_mode="floor").clamp(-(2**30), 2**30).long().unbind(-1)
     return torch.add(row, column, alpha=2**31)
 
 

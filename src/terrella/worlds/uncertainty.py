@@ -15,9 +15,9 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import nn
 
-from ..core.backend import constant, plus
+from ..core.backend import constant, derived, plus
 from ..core.state import State
-from ..space.camera import yaw
+from ..space.camera import turn_between
 from .generator import Conditioning
 from .parts import Absent, Channels
 
@@ -116,13 +116,15 @@ class UncertaintyNetwork(nn.Module):
     def calibrated(self, answer: torch.Tensor) -> torch.Tensor:
         """Linear between the knots; in proportion beyond them, up to the ceiling."""
         answers, errors = self.answers, self.errors
-        within = answer.clamp(answers[0], answers[-1])
-        below = torch.searchsorted(answers[1:-1], within)  # nan comes after all
-        knots = torch.stack([answers, errors], 1).unfold(0, 2, 1)[below]  # [..., answers or errors, below or above]
-        low, high = knots.unbind(-1)
-        share = (within - low[..., 0]) / (high - low)[..., 0].clamp_min(1e-6)
-        inside = torch.lerp(low[..., 1], high[..., 1], share)
-        return torch.minimum(inside * (answer / within.clamp_min(1e-6)), self.ceiling)
+        steps, rises = derived(_steps, answers), derived(torch.diff, errors)
+        shares = ((answer[..., None] - answers[:-1]) / steps).clamp(0, 1)  # how far it is from each knot to the next
+        inside = shares @ rises + errors[0]
+        within = answer.clamp(answers[0], answers[-1]).clamp_min(1e-6)
+        return torch.minimum(inside * (answer / within), self.ceiling)
+
+
+def _steps(knots: torch.Tensor) -> torch.Tensor:
+    return knots.diff().clamp_min(1e-6)
 
 
 @final
@@ -151,15 +153,14 @@ class UncertaintyProbe(Absent):
 def drift(before: State, after: State, led: bool) -> torch.Tensor:
     """`gone` [B, len(GONE)] of `after`, one step further from evidence than `before`. led: whether its pose was observed."""
     gone = before["gone"]
-    steps, way = gone[:, :1] + 1, gone[:, 1:3]
     if led:
-        way = torch.zeros_like(way)
-    elif "pose" in after:
-        poses = torch.stack([after["pose"], before["pose"]])
-        turn = torch.sub(*yaw(poses).unbind(0))
-        metres = torch.linalg.vector_norm(poses[0, :, :2] - poses[1, :, :2], dim=-1)
-        way = way + torch.stack([metres, torch.atan2(turn.sin(), turn.cos()).abs()], 1)
-    return torch.cat([steps, way, gone[:, 3:]], 1)
+        return torch.cat([gone[:, :1] + 1, torch.zeros_like(gone[:, 1:3]), gone[:, 3:]], 1)
+    if "pose" not in after:
+        return gone + constant(torch.tensor, gone.device, (1.0, 0.0, 0.0, 0.0, 0.0))
+    here, then = after["pose"], before["pose"]
+    metres = torch.linalg.vector_norm(here[:, :2] - then[:, :2], dim=-1, keepdim=True)
+    one, nothing = (constant(torch.tensor, gone.device, row).expand(len(gone), -1) for row in ((1.0,), (0.0, 0.0)))
+    return gone + torch.cat([one, metres, turn_between(here, then[:, None]), nothing], 1)
 
 
 def placed(gone: torch.Tensor) -> torch.Tensor:
