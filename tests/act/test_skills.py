@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 
 from terrella.act.actor_network import ActorConfig
 from terrella.act.imitation_network import ImitationConfig, ImitationNetwork
 from terrella.act.sentences import vocabulary_of
 from terrella.act.skills.library import Skill, SkillLibrary
+from terrella.act.skills.observed_goal import ObservedGoal
 from terrella.act.skills.phrases import Phrase, goal_of, phrases_of
 from terrella.act.skills.predictor import SkillOutlook, SkillPredictor
 from terrella.act.skills.search import SkillSearch, undone
 from terrella.core.errors import CheckpointError, PlanningError
+from terrella.core.spec import Spec
 
 TEXTS = [
     f"{verb} {colour} {kind}"
@@ -151,6 +155,55 @@ def test_what_is_left_of_a_plan_is_planned_anew():
 def test_goals_that_cannot_be_planned_are_named_in_a_sentence(goal, said):
     with pytest.raises(PlanningError, match=said):
         planned(goal)
+
+
+def goal_of_hand(library, hand, within=0.05):
+    spec = Spec("made", spaces.Discrete(2), {"hand": spaces.Box(0, 2, (1,), np.float32)}, (), 0.1)
+    return ObservedGoal.of(f"hand={hand}", {"hand": torch.tensor([[float(hand)]])}, spec, within, library)
+
+
+def test_an_observation_is_reached_by_the_skills_that_end_there():
+    library = library_of()
+    search, seen = SkillSearch(library), {"hand": torch.tensor([[float(START)]])}
+    carried = search.towards(goal_of_hand(library, CARRIES), seen)
+    assert [[len(texts) for texts in group] for group in carried] == [[4]], "one skill is enough"
+    assert search.plan(carried, seen).steps[0].text.startswith("pick up the")
+    assert goal_of_hand(library, START).distance({"hand": torch.tensor([[0.0], [2.0]])}).tolist() == pytest.approx(
+        [0, 1], abs=1e-3
+    )
+    with pytest.raises(
+        PlanningError, match="no skill ends within 0.05 of hand=1.5: 'go .*' comes nearest, 0.25 away; .* 0.26"
+    ):
+        search.towards(goal_of_hand(library, 1.5), seen)
+
+
+def test_a_skill_that_cannot_begin_yet_comes_after_another():
+    """Nothing is put down nor picked up while something is carried, so another skill is first."""
+    library = library_of()
+    hands = library.ends["hand"].clone()
+    hands[[text.startswith("put") for text in library.end_texts]] = 0.5
+    library = replace(library, ends={"hand": hands})
+    groups = SkillSearch(library).towards(goal_of_hand(library, 0.5), {"hand": torch.tensor([[float(CARRIES)]])})
+    plan = SkillSearch(library).plan(groups, {"hand": torch.tensor([[float(CARRIES)]])})
+    assert [step.text.split()[0] for step in plan.steps] == ["go", "put"] and plan.probability > 0.4
+
+
+def test_a_goal_that_the_skills_do_not_see_is_named():
+    spec = Spec("made", spaces.Discrete(2), {"eye": spaces.Box(0, 2, (1,), np.float32)}, (), 0.1)
+    with pytest.raises(
+        PlanningError, match="the skills do not see 'eye'; they see hand. Give a goal of these, or in words."
+    ):
+        ObservedGoal.of("eye=1", {"eye": torch.ones(1, 1)}, spec, 0.05, library_of())
+
+
+def test_a_picture_as_a_goal_is_compared_in_the_size_of_the_ends():
+    ends = {"rgb": torch.zeros(2, 4, 4, 3, dtype=torch.uint8)}
+    ends["rgb"][1] = 204
+    library = replace(library_of(), ends=ends, end_texts=("go to the red key", "go to the blue key"))
+    spec = Spec("made", spaces.Discrete(2), {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8)}, (), 0.1)
+    goal = ObservedGoal.of("a.png", {"rgb": torch.full((1, 8, 8, 3), 255, dtype=torch.uint8)}, spec, 0.3, library)
+    assert goal.instructions(library) == ("go to the blue key",)
+    assert goal.distance({"rgb": torch.full((1, 8, 8, 3), 255)}).item() < 0.01
 
 
 def test_a_name_stands_for_a_goal_of_others(tmp_path):

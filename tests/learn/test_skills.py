@@ -239,10 +239,34 @@ def test_goals_that_no_skill_reaches_are_refused_before_acting(library, words, s
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("goal", ["there.png", "grid=3"])
-def test_a_goal_that_is_not_in_words_is_named(goal, library, capsys):
+@pytest.mark.parametrize(
+    "goal, words",
+    [
+        ("there.png", "shows no pictures; give a state, or CHANNEL=VALUE"),
+        ("grid=3", "the goal for 'grid' has 1 numbers, where"),
+        ("reward=1", "the skills do not see 'reward'; they see grid"),
+        ("shape=1", "'shape'"),
+    ],
+)
+def test_an_observation_that_is_no_goal_is_named(goal, words, library, capsys):
+    assert learned(library) == 0
     assert main(["plan", NAME, "--skills", str(library[0]), "--goal", goal]) == 2
-    assert "skills take a goal in words" in capsys.readouterr().err
+    assert words in capsys.readouterr().err
+
+
+def test_an_observation_is_a_goal_of_skills(library, tmp_path, capsys):
+    """To stand on the blue ball in the last cell, whatever else is seen: of the starts those with the blue ball there reach it."""
+    assert learned(library) == 0
+    cells = [[[None]] * 6 + [[6]]]
+    (tmp_path / "goal.json").write_text(json.dumps(cells))
+    words = ["plan", NAME, "--skills", str(library[0]), "--goal", f"grid={tmp_path / 'goal.json'}", "--episodes", "8"]
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    world = GymnasiumWorld(Errands)
+    blue = [bool(world.render(world.start(1, make_rng(n)), ("grid",))["grid"][0, 0, 6, 0] == 5) for n in range(8)]
+    print(blue, result)
+    assert [one["finished"] for one in result["episodes"]] == blue and 0 < sum(blue) < 8
 
 
 def test_a_library_is_not_written_over_something_else(library, capsys):

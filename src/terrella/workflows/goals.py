@@ -35,6 +35,11 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
     return {channel: _value(text, channel, spec)}
 
 
+def is_observation(text: str) -> bool:
+    """Whether a goal of skills is a picture, CHANNEL=VALUE or numbers, not words."""
+    return "=" in text or text.lower().endswith(PICTURES) or not any(letter.isalpha() for letter in text)
+
+
 def with_estimated_pose(goal: Observation, world: World) -> Observation:
     """A goal that is one picture [1, ...], with the pose where the world localises it; any other goal as it is."""
     if set(goal) != {"rgb"} or not {"rgb", "pose"} <= set(world.spec.channels):

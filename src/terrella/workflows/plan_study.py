@@ -67,8 +67,8 @@ class PlanConfig:
     agent: str | None = None
     """A policy that acts instead of the search: a folder, or a policy name as for `terrella evaluate`."""
     skills: Path | None = None
-    """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills. Without --goal
-    each episode has the environment's own instruction."""
+    """A library of `terrella skills learn`: the goal is a sentence, reached by the likeliest order of its skills; or a picture,
+    numbers or CHANNEL=VALUE, reached by skills that end there. Without --goal each episode has the environment's instruction."""
     watts: float | None = None
     """Power that planning may take, in watts, at one decision each --replan moves: for it down to a sixteenth of the plans and
     one round are searched, and the result says how many, or that it is not kept. Without an energy counter that may be read,

@@ -16,18 +16,20 @@ from ..act.planning import FullyObserved
 from ..act.skills.actor import SkillActor
 from ..act.skills.imagined import PlanRollouts
 from ..act.skills.library import SkillLibrary
+from ..act.skills.observed_goal import ObservedGoal
 from ..act.skills.search import SkillSearch
 from ..core.errors import TerrellaError
 from ..core.instruction import bytes_to_text
 from ..core.policy import act
+from ..core.spec import Spec
 from ..core.world import World, make_rng
 from ..learn.recipes.imitation import open_demonstrations
 from ..learn.recipes.skills import SkillTraining, learn_skills
 from ..library import is_truth
 from ..measure.statistics import Figure, wilson
-from .goals import PICTURES, REWARD
+from .goals import REWARD, is_observation, read_goal
 from .opening import EnvironmentConfig, device_of, load_named
-from .plan_study import PlanConfig
+from .plan_study import WITHIN, PlanConfig
 from .progress import Progress, silent, stage
 from .real_environment import STEPS, check_alike, open_copied, open_real
 from .results import changed_settings, jsonable, table_lines
@@ -125,6 +127,7 @@ class SkillPlanResult:
     goal: str | None  # None: each episode has a goal of its own
     episodes: tuple[SkillEpisode, ...]
     stopped: bool = False
+    within: float | None = None  # the distance at which a goal is reached that is no sentence
 
     @property
     def finished(self) -> Figure:
@@ -141,6 +144,8 @@ class SkillPlanResult:
 
     def summary(self) -> str:
         lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
+        if self.within is not None:
+            lines = [f"The goal, {self.goal} within {self.within:g}, was reached in {self.finished} of the episodes."]
         if not self.goal:
             mean = sum(one.reward for one in self.episodes) / len(self.episodes)
             lines.append(f"By the environment's own rules {self.rewarded} succeeded; their mean return is {mean:.2f}.")
@@ -214,15 +219,15 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     """Plans with the skills of a library and acts in an environment. PlanningError for a goal that it does not understand, or that
     no order of its skills is likely to reach from the first start."""
     used = {"goal", "skills", "rollouts", "real", "episodes", "steps", "seed", *vars(config.environment), "device"}
+    used |= {"within"} if is_observation(config.goal) else set()
     if useless := [key for key in changed_settings(config) if key.replace("-", "_") not in used]:
         raise TerrellaError(f"--{useless[0].replace('_', '-')}: plans of skills have no use for that.")
-    if config.goal.partition("=")[1] or config.goal.lower().endswith(PICTURES):
-        raise TerrellaError(f"--goal {config.goal}: skills take a goal in words, as in --goal 'go to the red ball'.")
     if config.episodes < 1 or (config.steps is not None and config.steps < 1):
         raise TerrellaError("--episodes and --steps are whole numbers from 1 up.")
     assert config.skills is not None
-    library, goal = SkillLibrary.load(config.skills), None if config.goal == REWARD else config.goal
+    library = SkillLibrary.load(config.skills)
     inside, world = _worlds(name, config, progress)
+    goal = _goal_of(config, world.spec, library)
     rollouts = None
     if inside is not None:
         rollouts = PlanRollouts(inside, SkillActor(library, inside.spec, goal), config.rollouts, config.seed)
@@ -233,8 +238,10 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     if goal is not None:
         search = SkillSearch(library)
         first = world.render(world.start(1, make_rng(config.seed)), actor.sees)
-        plan = search.plan(search.instructions_of(goal), first)
+        observed = isinstance(goal, ObservedGoal)
+        plan = search.plan(search.towards(goal, first) if observed else search.instructions_of(goal), first)
         progress(f"the plan: {plan}, {plan.probability:.0%} in all")
+    wanted, within = None if goal is None else str(goal), goal.within if isinstance(goal, ObservedGoal) else None
     episodes, rng = list[SkillEpisode](), make_rng(config.seed)
     try:
         with stage("acting", progress) as report:
@@ -245,8 +252,19 @@ def plan_with_skills(name: str, config: PlanConfig, *, progress: Progress = sile
     except KeyboardInterrupt:
         if not episodes:
             raise
-        return SkillPlanResult(goal, tuple(episodes), True)
-    return SkillPlanResult(goal, tuple(episodes))
+        return SkillPlanResult(wanted, tuple(episodes), True, within)
+    return SkillPlanResult(wanted, tuple(episodes), within=within)
+
+
+def _goal_of(config: PlanConfig, spec: Spec, library: SkillLibrary) -> str | ObservedGoal | None:
+    """The goal of all episodes; None: each has its own instruction."""
+    within = WITHIN if config.within is None else config.within
+    if not within > 0:
+        raise TerrellaError("--within is above 0.")
+    if config.goal == REWARD or not is_observation(config.goal):
+        return None if config.goal == REWARD else config.goal
+    value = {name: value[None] for name, value in read_goal(config.goal, spec).items()}
+    return ObservedGoal.of(config.goal, value, spec, within, library)
 
 
 def _worlds(name: str, config: PlanConfig, progress: Progress) -> tuple[World | None, World]:

@@ -18,7 +18,8 @@ from ..imitation_network import TEXT
 from .imagined import ALTERNATIVES, PlanRollouts
 from .library import SkillLibrary
 from .memory import SkillMemory
-from .search import SkillSearch, undone
+from .observed_goal import ObservedGoal
+from .search import Groups, SkillSearch, undone
 
 PATIENCE = 2.0  # times the usual longest duration, after which an instruction that is not done is planned anew
 MOST_PLANS = 8  # of an episode; the last one is kept to
@@ -27,12 +28,16 @@ SURPRISE = 2.0  # spreads by which a forecast may differ from what came
 
 @final
 class SkillActor:
-    """A Policy that reaches goals in words by the skills of a library, however unlikely its best plan is. goal: for all episodes;
-    None: the text that it is shown. rollouts: choose among plans in a world. ActionError or ChannelError if the library is for
-    others, PlanningError for unknown words."""
+    """A Policy that reaches goals by the skills of a library, however unlikely its best plan is. goal: in words or an observation,
+    for all episodes; None: the text that it is shown. rollouts: choose among plans in a world. ActionError or ChannelError if the
+    library is for others, PlanningError for unknown words."""
 
     def __init__(
-        self, library: SkillLibrary, spec: Spec, goal: str | None = None, rollouts: PlanRollouts | None = None
+        self,
+        library: SkillLibrary,
+        spec: Spec,
+        goal: str | ObservedGoal | None = None,
+        rollouts: PlanRollouts | None = None,
     ):
         shown = spec if goal is None else replace(spec, channels={**spec.channels, TEXT: TEXT_SPACE})
         self.policy, self.library, self.goal = ImitationActor(library.network, shown), library, goal
@@ -66,10 +71,8 @@ class SkillActor:
         waypoints = fast["waypoints"].to(self.library.network.mean.device) if self.library.network.waypoints else None
         done = self.library.outlook(seen, texts, hidden, waypoints).done.cpu() > self.library.threshold
         memory = [replace(one, looks_done=(one.looks_done + 1) * over) for one, over in zip(memory, done.tolist())]
-        memory = [
-            self._thought(one, str(goal), {name: value[row : row + 1] for name, value in seen.items()})
-            for row, (one, goal) in enumerate(zip(memory, goals))
-        ]
+        each = [{name: value[row : row + 1] for name, value in seen.items()} for row in range(len(memory))]
+        memory = [self._checked(self._thought(one, str(goal), now), now) for one, goal, now in zip(memory, goals, each)]
         texts = torch.stack([torch.tensor(text_to_bytes(one.text)) for one in memory])
         action, fast = self.policy.act({**seen, TEXT: texts}, State.stack([one.fast for one in memory]), rng)
         return action, [replace(one, fast=fast.at(row), steps=one.steps + 1) for row, one in enumerate(memory)]
@@ -77,7 +80,7 @@ class SkillActor:
     def _thought(self, one: SkillMemory, goal: str, seen: Observation) -> SkillMemory:
         """The memory before the next action: with a plan, and the instruction that is due."""
         if goal != one.goal:
-            return self._begun(replace(one, goal=goal, groups=self.search.instructions_of(goal), plan=None), seen, goal)
+            return self._begun(replace(one, goal=goal, groups=self._groups(goal, seen), plan=None), seen, goal)
         if one.plan is None or one.at == len(one.plan.steps):
             return one
         step, left = one.plan.steps[one.at], len(one.plan.steps) - one.at
@@ -93,6 +96,27 @@ class SkillActor:
         elif one.steps > PATIENCE * step.skill.most_steps and one.plans < MOST_PLANS:
             return self._begun(one, seen, f"'{step.text}' is not done after {one.steps} steps")
         return one
+
+    def _checked(self, one: SkillMemory, seen: Observation) -> SkillMemory:
+        """With an observation as the goal the plan is over once that is reached, and not before."""
+        if not isinstance(self.goal, ObservedGoal) or one.plan is None:
+            return one
+        away, over = float(self.goal.distance(seen)[0]), len(one.plan.steps)
+        if away <= self.goal.within:
+            return one if one.finished else replace(one, at=over, events=(*one.events, f"reached: {away:.3g} away"))
+        if not one.finished:
+            return one
+        if one.plans == MOST_PLANS:
+            return replace(one, at=over - 1)
+        again = replace(one, groups=self._groups(one.goal, seen), plan=None)
+        return self._begun(again, seen, f"still {away:.3g} away")
+
+    def _groups(self, goal: str, seen: Observation) -> Groups:
+        return (
+            self.search.towards(self.goal, seen)
+            if isinstance(self.goal, ObservedGoal)
+            else self.search.instructions_of(goal)
+        )
 
     def _next(self, one: SkillMemory, event: str) -> SkillMemory:
         assert self._blank is not None

@@ -14,6 +14,7 @@ from ...core.similar import did_you_mean
 from ...core.world import Observation
 from ..sentences import words_of
 from .library import Skill, SkillLibrary
+from .observed_goal import ObservedGoal
 from .phrases import ARTICLES, PRONOUNS, Phrase, completed, goal_of, things_of
 
 STEP_COST = 0.002  # of a step, in nats: of two orders that are as likely the shorter one
@@ -31,6 +32,10 @@ class SkillForecast:
     spread: float  # standard deviation of that over the states in which it may begin
     steps: float  # that it takes
 
+    @property
+    def cost(self) -> float:
+        return STEP_COST * self.steps - math.log(max(self.probability, 1e-9))
+
 
 @dataclass(frozen=True)
 class SkillPlan:
@@ -42,6 +47,11 @@ class SkillPlan:
     @property
     def probability(self) -> float:
         return math.prod(step.probability for step in self.steps)
+
+    @property
+    def cost(self) -> float:
+        """In nats: what is unlikely, and what takes long."""
+        return sum(step.cost for step in self.steps)
 
     def __str__(self) -> str:
         return ", then ".join(f"{step.text} ({step.probability:.0%})" for step in self.steps)
@@ -83,6 +93,14 @@ class SkillSearch:
             for texts in read[-1]:
                 things = [*things_of(texts[0]), *things]  # the last phrase first
         return tuple(read)
+
+    def towards(self, goal: ObservedGoal, seen: Observation) -> Groups:
+        """The instructions that bring a goal about, alone or after any other, whichever is likelier to work from an observation
+        [1, ...]. PlanningError if none does."""
+        last = (goal.instructions(self.library),)
+        every = (tuple(dict.fromkeys(text for text in self.library.end_texts if text)),)
+        ways: list[Groups] = [(last,), (every, last)]
+        return min(ways, key=lambda groups: self._cheapest(groups, seen, 1)[0].cost)
 
     def _instructions(self, phrase: str, things: Sequence[str]) -> tuple[str, ...]:
         fits = self._fits(phrase)
@@ -134,8 +152,7 @@ class SkillSearch:
             for number, texts in enumerate(groups[at]):
                 for text in texts if number not in done else ():
                     step = self.after(last, text) if last else now[text]
-                    paid = STEP_COST * step.steps - math.log(max(step.probability, 1e-9))
-                    heapq.heappush(queue, (cost + paid, next(tie), at, done | {number}, (*steps, step)))
+                    heapq.heappush(queue, (cost + step.cost, next(tie), at, done | {number}, (*steps, step)))
         return plans
 
     def after(self, before: str, text: str) -> SkillForecast:
