@@ -85,10 +85,10 @@ def orthogonal(matrices: torch.Tensor) -> torch.Tensor:
     first, third, fifth = QUINTIC
     x = matrices / (matrices.norm(dim=(1, 2), keepdim=True) + 1e-7)
     square, steps = x @ x.mT, []  # each round multiplies x by a polynomial of the small `square`
-    for _ in range(ROUNDS):
+    while len(steps) < ROUNDS:
+        square = steps[-1] @ square @ steps[-1] if steps else square
         step = torch.baddbmm(square, square, square, beta=third, alpha=fifth)
         step.diagonal(dim1=1, dim2=2).add_(first)
-        square = step @ square @ step
         steps.append(step)
     return reduce(lambda whole, step: step @ whole, steps) @ x
 
