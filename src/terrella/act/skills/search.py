@@ -19,6 +19,7 @@ from .phrases import ARTICLES, PRONOUNS, Phrase, completed, goal_of, things_of
 
 STEP_COST = 0.002  # of a step, in nats: of two orders that are as likely the shorter one
 LEAST_ENDS = 4  # ends of the same instruction from which these alone are what it brings about
+LIKELY = 0.5  # the probability above which a skill needs no other before it
 MOST_ENDS = 64  # ends at which an instruction is judged
 
 
@@ -95,12 +96,15 @@ class SkillSearch:
         return tuple(read)
 
     def towards(self, goal: ObservedGoal, seen: Observation) -> Groups:
-        """The instructions that bring a goal about, alone or after any other, whichever is likelier to work from an observation
-        [1, ...]. PlanningError if none does."""
+        """The instructions that bring a goal about, alone or, where that is unlikely to work from an observation [1, ...], after any
+        other. PlanningError if none does."""
         last = (goal.instructions(self.library),)
-        every = (tuple(dict.fromkeys(text for text in self.library.end_texts if text)),)
-        ways: list[Groups] = [(last,), (every, last)]
-        return min(ways, key=lambda groups: self._cheapest(groups, seen, 1)[0].cost)
+        alone: Groups = (last,)
+        first = self._cheapest(alone, seen, 1)[0]
+        if first.probability > LIKELY:
+            return alone
+        after: Groups = ((tuple(dict.fromkeys(text for text in self.library.end_texts if text)),), last)
+        return min((alone, after), key=lambda groups: self._cheapest(groups, seen, 1)[0].cost)
 
     def _instructions(self, phrase: str, things: Sequence[str]) -> tuple[str, ...]:
         fits = self._fits(phrase)
