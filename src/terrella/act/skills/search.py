@@ -96,8 +96,8 @@ class SkillSearch:
         return tuple(read)
 
     def towards(self, goal: ObservedGoal, seen: Observation) -> Groups:
-        """The instructions that bring a goal about, alone or, where that is unlikely to work from an observation [1, ...], after any
-        other. PlanningError if none does."""
+        """The instructions that bring a goal about; where they are unlikely to work from an observation [1, ...], after any other.
+        PlanningError if none does."""
         last = (goal.instructions(self.library),)
         alone: Groups = (last,)
         first = self._cheapest(alone, seen, 1)[0]
