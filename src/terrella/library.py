@@ -97,9 +97,7 @@ def load(
         raise TerrellaError(f"{text} is the truth itself: only a learned world can be drawn faster; leave `fast` out.")
     if text == "doom" or text.startswith("doom:"):
         _require("vizdoom", "The real game needs ViZDoom", "sim")
-        from .sim.doom import Doom, DoomConfig
-
-        return Doom(DoomConfig(scenario=text.partition(":")[2] or GAME.partition(":")[2], **options))
+        return _open_doom(text.partition(":")[2] or GAME.partition(":")[2], options)
     if text.startswith("mujoco:"):
         _require("mujoco", "MuJoCo's worlds need mujoco", "mujoco")
         from .sim.mujoco_world import MujocoConfig, MujocoWorld
@@ -121,6 +119,19 @@ def _id_and_repeat(name: str) -> tuple[str, int]:
     if not 1 <= int(match[2]) <= 100:
         raise TerrellaError(f"{name}: the number after @ is for how many steps each action is held, 1 to 100.")
     return match[1], int(match[2])
+
+
+def _open_doom(name: str, options: dict[str, Any]) -> World:
+    """By "SCENARIO" or "SCENARIO:TASK"."""
+    from .sim.doom import Doom, DoomConfig
+
+    scenario, _, task = name.partition(":")
+    config = DoomConfig(scenario=scenario, **options)
+    if not task:
+        return Doom(config)
+    from .sim.doom_rooms import DoomRooms
+
+    return DoomRooms(config, task)
 
 
 def _open_gymnasium(env: str, repeat: int, options: dict[str, Any]) -> World:

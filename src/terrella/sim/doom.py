@@ -70,6 +70,8 @@ class DoomConfig:
     timeout_tics: int = 0
     # Difficulty, 1 to 5. Default: the scenario's own, 3 on the maps of a game.
     skill: int | None = None
+    # Tics of a step, 35 a second, for which its buttons are held.
+    tics: int = 1
 
 
 class Doom:
@@ -90,7 +92,7 @@ class Doom:
         self._shrink = 384 // height
         scenario, self._maps = _named(config.scenario)
         self._game, self.buttons, alive = _open_game(config, scenario, self._maps)
-        self._wad = _wad(self._game)
+        self.wad = _wad(self._game)
         self._places: dict[str, Sectors] = {}
         self._ticket = 0
         self._seen: dict[str, torch.Tensor] = {}
@@ -110,7 +112,7 @@ class Doom:
             action=spaces.MultiBinary(len(self.buttons)),
             channels={**channels, "reward": REWARD, "done": DONE},
             observes=(),
-            dt_s=1 / TICS_PER_S,
+            dt_s=config.tics / TICS_PER_S,
             units={"depth": "m", "pose": POSE_UNIT},
             action_names=self.buttons,
             keys={
@@ -130,7 +132,7 @@ class Doom:
         state = self._game.get_state()
         if self._maps or state is None:
             return {}
-        walls = Sectors(state.sectors, skies(self._wad, self._game.get_doom_map()))
+        walls = Sectors(state.sectors, skies(self.wad, self._game.get_doom_map()))
         return doom_system(walls.lines[walls.solid], UNITS_PER_M).to_json()
 
     def start(self, batch: int, rng: torch.Generator) -> State:
@@ -154,11 +156,11 @@ class Doom:
         return prior if prior is not None else self.start(1, rng)
 
     def imagine(self, state: State, action: torch.Tensor, rng: torch.Generator) -> State:
-        """One tic of the game. After `done` it stands still."""
+        """One step of the game. After `done` it stands still."""
         buttons = self.spec.check_action(action, 1)
         self._check_present(state)
         if not self._done:
-            self._reward = float(self._game.make_action(buttons[0].tolist(), 1))
+            self._reward = float(self._game.make_action(buttons[0].tolist(), self.config.tics))
             self._done = self._game.is_episode_finished()
         else:
             self._reward = 0.0
@@ -172,12 +174,39 @@ class Doom:
     def close(self) -> None:
         self._game.close()
 
+    def walls(self) -> Sectors:
+        """The geometry of the map, whose heights are those of now."""
+        return Sectors(self._game.get_state().sectors, skies(self.wad, self.map_name))
+
+    @property
+    def map_name(self) -> str:
+        return self._game.get_doom_map()
+
+    def place(self) -> tuple[float, float, float]:
+        """(x, y) of the player in map units, and the heading in radians."""
+        x, y, _, yaw_deg, _ = (float(value) for value in np.asarray(self._present.game_variables))
+        return x, y, math.radians(yaw_deg)
+
+    def placed(self, state: State, x: float, y: float) -> State:
+        """The player at (x, y), map units, of the same heading. For skills below 5, at which the game allows it."""
+        self._check_present(state)
+        self._warp(x, y)
+        return self._advance()
+
+    def judge(self, reward: float, over: bool) -> None:
+        """The reward of this step by the rules of a task in place of the map's, and whether the episode ends here."""
+        self._reward, self._done, self._seen = reward, self._done or over, {}
+
+    def _warp(self, x: float, y: float) -> None:
+        self._game.send_game_command(f"warp {x:.0f} {y:.0f}")
+        self._game.make_action([0.0] * len(self.buttons), 2)
+
     def _enter_map(self) -> None:
         """Loads the geometry of the episode's map."""
         name, sectors = self._game.get_doom_map(), self._game.get_state().sectors
         if name not in self._places:
-            self._places[name] = Sectors(sectors, skies(self._wad, name))
-        self._walls, self._origin = self._places[name], map_origin(self._wad.stem, name) if self._maps else (0.0, 0.0)
+            self._places[name] = Sectors(sectors, skies(self.wad, name))
+        self._walls, self._origin = self._places[name], map_origin(self.wad.stem, name) if self._maps else (0.0, 0.0)
         self._walls.update(sectors)
         self._walls.initial_heights = self._walls.heights
 
@@ -186,8 +215,7 @@ class Doom:
         pick_ups = [thing for thing in self._game.get_state().objects if thing.category in PICK_UPS]
         if pick_ups and float(torch.rand(1, generator=rng)) < 0.75:
             place = pick_ups[int(torch.randint(len(pick_ups), (1,), generator=rng))]
-            self._game.send_game_command(f"warp {place.position_x:.0f} {place.position_y:.0f}")
-            self._game.make_action([0.0] * len(self.buttons), 2)
+            self._warp(place.position_x, place.position_y)
             if self._game.is_episode_finished():  # it was behind the exit
                 self._game.new_episode()
                 self._enter_map()

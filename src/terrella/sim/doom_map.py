@@ -1,8 +1,9 @@
 """A Doom map as geometry: the maps of a WAD, and exact depth by ray casting its sectors."""
 
+import math
 import re
 import struct
-from collections import Counter
+from collections import Counter, defaultdict
 from functools import lru_cache
 from pathlib import Path
 
@@ -50,6 +51,31 @@ def skies(wad: Path, name: str) -> np.ndarray:
         sectors = re.findall(rb"\bsector\b[^{]*\{([^}]*)\}", data)
         return np.array([re.search(rb'textureceiling\s*=\s*"F_SKY1"', text) is not None for text in sectors], bool)
     return np.zeros(0, bool)
+
+
+def wall_textures(wad: Path, name: str) -> list[str]:
+    """Of each sector of map `name` the texture of most of its walls, by length; [] where the map is not in the text format."""
+    table = lumps(wad)
+    at = [entry[0].upper() for entry in table].index(name.upper())
+    for kind, offset, length in table[at + 1 : at + 12]:
+        if kind == "TEXTMAP":
+            with open(wad, "rb") as file:
+                file.seek(offset)
+                text = file.read(length).decode("latin-1")
+            break
+    else:
+        return []
+    blocks: dict[str, list[dict[str, str]]] = {kind: [] for kind in ("vertex", "linedef", "sidedef", "sector")}
+    for kind, body in re.findall(r"\b(vertex|linedef|sidedef|sector)\b[^{]*\{([^}]*)\}", text):
+        blocks[kind].append({key: value.strip('"') for key, value in re.findall(r"(\w+)\s*=\s*([^;]+);", body)})
+    corners = [(float(one["x"]), float(one["y"])) for one in blocks["vertex"]]
+    lengths = [defaultdict[str, float](float) for _ in blocks["sector"]]
+    for line in blocks["linedef"]:
+        length_of = math.dist(corners[int(line["v1"])], corners[int(line["v2"])])
+        for side in (blocks["sidedef"][int(line[end])] for end in ("sidefront", "sideback") if end in line):
+            if "texturemiddle" in side:
+                lengths[int(side["sector"])][side["texturemiddle"].upper()] += length_of
+    return [max(one, key=lambda texture: one[texture], default="") for one in lengths]
 
 
 class Sectors:

@@ -51,7 +51,7 @@ class EnvironmentConfig:
     """A Python file (FILE.py or FILE.py:NAME) with an Adapter that finds depth, poses and more."""
     task: str | None = None
     """A task of a ready robot: `road` or `road:SEED` (another town) of mujoco:car, `stack` and others of mujoco:table; the same
-    as the name mujoco:car:road."""
+    as the name mujoco:car:road. `rooms` of doom:my_way_home: instructions that name a room."""
     randomise: str | None = None
     """A TOML or JSON file of distributions, from which each episode of a simulator draws masses, friction, delay and more."""
 
@@ -63,8 +63,10 @@ class EnvironmentConfig:
         from ..sim import randomised
 
         if self.task is not None:
-            if not name.startswith("mujoco:"):
-                raise TerrellaError("--task is for the robots of MuJoCo; other worlds have one task.")
+            if not name.startswith(("mujoco:", "doom:")):
+                raise TerrellaError(
+                    "--task is for the robots of MuJoCo and for maps of Doom; other worlds have one task."
+                )
             name = f"{name}:{self.task}"
         if self.fps is not None and not 0 < self.fps < 10_000:
             raise TerrellaError(
