@@ -68,7 +68,7 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
                     torch.ones(STORIES, objects.config.rows, dtype=torch.bool),
                     looks,
                     acts,
-                    chance.seeds(STORIES, rng),
+                    chance.uniforms(chance.seeds(STORIES, rng), objects.draws),
                 )
                 low |= heights(world, billboards[:, 0]) < LOW_M
             fell.append(float(low.float().mean()))

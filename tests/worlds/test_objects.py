@@ -66,7 +66,13 @@ def billboards(objects: Billboards, *places: tuple[float, float, float]) -> torc
 
 
 def step(objects: Billboards, before: torch.Tensor, seen=(True, True, True, True)) -> torch.Tensor:
-    return objects.act(before, torch.tensor([seen]), viewer(), torch.zeros(1, 2, 3), chance.seeds(1, make_rng(0)))
+    return objects.act(
+        before,
+        torch.tensor([seen]),
+        viewer(),
+        torch.zeros(1, 2, 3),
+        chance.uniforms(chance.seeds(1, make_rng(0)), objects.draws),
+    )
 
 
 def test_a_billboard_does_what_is_told_of_it_and_its_ages_go_on():
@@ -91,11 +97,21 @@ def test_by_chance_as_often_as_told():
     objects.next_look.bias.data[:2] = torch.tensor([0.0, 1.0986])  # one to three
     many, rng = billboards(objects, (4.0, 0.0, 0.0)).expand(800, -1, -1), make_rng(1)
     seen = torch.ones(800, 4, dtype=torch.bool)
-    looks = objects.act(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, rng))[:, 0, LOOK]
+    looks = objects.act(
+        many,
+        seen,
+        viewer().expand(800, 7),
+        torch.zeros(800, 2, 3),
+        chance.uniforms(chance.seeds(800, rng), objects.draws),
+    )[:, 0, LOOK]
     assert abs(float((looks == BLUE).float().mean()) - 0.75) < 0.05
-    again = objects.act(many, seen, viewer().expand(800, 7), torch.zeros(800, 2, 3), chance.seeds(800, make_rng(1)))[
-        :, 0, LOOK
-    ]
+    again = objects.act(
+        many,
+        seen,
+        viewer().expand(800, 7),
+        torch.zeros(800, 2, 3),
+        chance.uniforms(chance.seeds(800, make_rng(1)), objects.draws),
+    )[:, 0, LOOK]
     assert torch.equal(looks, again)
 
 

@@ -33,7 +33,7 @@ def uniform(seeds: torch.Tensor, shape: Sequence[int] = (), stream: int = 0) -> 
 
 def uniforms(seeds: torch.Tensor, shapes: Mapping[int, Sequence[int]]) -> dict[int, torch.Tensor]:
     """`uniform` of several streams, {stream: shape}, at once."""
-    if kernels_do(seeds):
+    if kernels_do(seeds) or not shapes:
         return {stream: uniform(seeds, shape, stream) for stream, shape in shapes.items()}
     counts = [math.prod(shape) for shape in shapes.values()]
     streams, which, steps = constant(_layout, seeds.device, tuple(shapes), tuple(counts)).split(

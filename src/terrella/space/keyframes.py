@@ -18,7 +18,20 @@ from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
 from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
-from .reproject import carry_unknown, colours_at, fill_holes, sight, unknown_alone
+from .reproject import (
+    MovingFrames,
+    agreement_of,
+    carry_things,
+    carry_unknown,
+    colours_at,
+    fill_holes,
+    moved,
+    places_in,
+    planes_at,
+    sight,
+    splat_frames,
+    unknown_alone,
+)
 from .views import arrays, over_views
 
 COARSE, FINE = 8, 2  # strides of the patches for finding keyframes and for the view's depth
@@ -96,6 +109,7 @@ def gathered(chosen: Sequence[Keyframes | None], size: tuple[int, int]) -> tuple
 
 # rgb uint8 [B, 3, H, W], depth [B, h, w] metres, pose [B, 7]
 RgbdFrame = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+LastFrames = RgbdFrame | MovingFrames | None
 
 
 @dataclass(frozen=True)
@@ -238,14 +252,26 @@ def look(
 
 def look_and_carry(
     shared: Keyframes, picks: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int,
-    own: Keyframes | None = None, last: RgbdFrame | None = None,
+    own: Keyframes | None = None, last: LastFrames = None,
 ) -> tuple[Glimpse, torch.Tensor | None]:  # fmt: skip
-    """`look`, and where that knows nothing, what the `last` frame (rgb, depth, pose) shows: as `carry_unknown` gives it."""
+    """`look`; and where that knows nothing, what the `last` frame (rgb, depth, pose) shows, as `carry_unknown` gives it; of K moving
+    frames, what `carry_things` gives, [B, K, 6, H, W]."""
     own = Keyframes.none(size, pose.device) if own is None else own
     if not kernels_do(pose):
         return look_slowly(shared, picks, pose, camera, size, slots, own, last)
     glimpse = _look_quickly(shared, picks, pose, camera, size, slots, own)
-    return glimpse, None if last is None else carry_unknown(*last, glimpse.known, glimpse.depth, pose, camera)
+    return glimpse, _carried(last, glimpse, pose, camera)
+
+
+def _carried(last: LastFrames, glimpse: Glimpse, pose: torch.Tensor, camera: Intrinsics) -> torch.Tensor | None:
+    """What `look_and_carry` gives beside the glimpse."""
+    if last is None:
+        return None
+    if not isinstance(last, MovingFrames):
+        return carry_unknown(*last, glimpse.known, glimpse.depth, pose, camera)
+    keys = last.depth.shape[:2]
+    targets = pose[:, None].expand(*keys, 7).flatten(0, 1)
+    return carry_things(*(part.flatten(0, 1) for part in last), targets, camera).unflatten(0, keys)
 
 
 def _look_quickly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
@@ -265,14 +291,14 @@ def _look_quickly(shared, picks, pose, camera, size, slots, own) -> Glimpse:
 
 
 def look_slowly(
-    shared, picks, pose, camera, size, slots, own, last: RgbdFrame | None = None
+    shared, picks, pose, camera, size, slots, own, last: LastFrames = None
 ) -> tuple[Glimpse, torch.Tensor | None]:
     """The same as `look_and_carry`, in plain tensor algebra, also for GPUs."""
     batch, valid, mine = len(pose), picks >= 0, picks >= len(shared)
     if not picks.shape[1] or not len(shared) + len(own):
         none = pose.new_zeros(batch, slots, 3, *size)
         nothing = Glimpse(none, none[:, :, 0], pose.new_full((batch, *size), FAR_M), pose.new_zeros(batch, *size))
-        return nothing, None if last is None else carry_unknown(*last, nothing.known, nothing.depth, pose, camera)
+        return nothing, _carried(last, nothing, pose, camera)
     theirs, ours = picks.clamp(0, max(0, len(shared) - 1)), (picks - len(shared)).clamp_min(0)
 
     def both(part: str, change: Callable[[torch.Tensor], torch.Tensor] = lambda tensor: tensor) -> torch.Tensor:
@@ -287,8 +313,9 @@ def look_slowly(
         return torch.where(mine.view(*mine.shape, *[1] * (first.ndim - 1)), own_part, first[theirs])
 
     key_depth, poses, rgb, keys = both("depth"), both("pose"), both("rgb", doubled) / 255, picks.shape[1]
-    viewers = [poses, pose[:, None]] if last is None else [poses, last[2][:, None], pose[:, None]]
-    viewers = torch.cat(viewers, 1)
+    moving = last if isinstance(last, MovingFrames) else None
+    others = [] if last is None else [last[2][:, None] if moving is None else moving.pose]
+    viewers = torch.cat([poses, *others, pose[:, None]], 1)
     turns = rotation(viewers)
     patch, turn = patches_slowly(key_depth, poses, camera, FINE, turns[:, :keys]), turns[:, -1]
     if len(shared):
@@ -296,14 +323,27 @@ def look_slowly(
     patch = patch * valid[..., None, None]
     depth = cast(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
     hit = depth < FAR_M
-    depth = fill_holes(depth)
-    if last is not None:  # as one keyframe more, whose colours are taken apart
-        key_depth = torch.cat([key_depth, last[1][:, None]], 1)
-    places, agreement, near = sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera)
+    # the last frame is one keyframe more, and moving frames are ones more, in views of their own, whose colours are taken apart
+    if moving is None:
+        key_depth = key_depth if last is None else torch.cat([key_depth, last[1][:, None]], 1)
+        depth = fill_holes(depth)
+        places, agreement, near = sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera)
+    else:
+        planes, splat = splat_frames(moving, turns[:, keys:-1], (pose, turn), camera)
+        filled = fill_holes(torch.cat([depth[:, None], splat], 1).flatten(0, 1)).unflatten(0, (batch, -1))
+        seen = torch.where(splat < FAR_M, splat, filled[:, 1:])
+        depth = filled[:, 0]
+        points = unproject(torch.cat([depth[:, None].expand(-1, keys, -1, -1), seen], 1), pose, camera, turn)
+        places, ahead = places_in(points, viewers[:, :-1], turns[:, :-1], camera)
+        carried = planes_at(planes, places[:, keys:])
+        held = torch.cat([planes_at(key_depth[:, :, None], places[:, :keys]), carried[:, :, 4:5]], 1)[:, :, 0]
+        agreement, near = agreement_of(held, places, ahead)
     depths = depth[:, None], near[:, :keys]
     likeness = torch.minimum(*depths) / torch.maximum(*depths)
     colours, trust = best_slowly(colours_at(rgb, places[:, :keys]), agreement[:, :keys], likeness, valid, slots)
     glimpse = Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
+    if moving is not None:
+        return glimpse, moved(carried, agreement[:, keys:], seen)
     if last is None:
         return glimpse, None
     colour, trust = colours_at((last[0] / 255)[:, None], places[:, keys:])[:, 0], agreement[:, keys:]

@@ -16,7 +16,7 @@ from ..core.state import State
 from .camera import Intrinsics, turn_between, yaw
 from .floorplan import NOWHERE, WALLS
 from .kernels_numba import recall as kernels
-from .keyframes import COARSE, Glimpse, Keyframes, RgbdFrame, look_and_carry, retrieve, vote_slowly
+from .keyframes import COARSE, Glimpse, Keyframes, LastFrames, look_and_carry, retrieve, vote_slowly
 from .patches import patch_count
 from .views import arrays, over_views
 
@@ -231,10 +231,10 @@ class Memory:
         return self.look_and_carry(held, pose, None, sources, slots, recorded)[0]
 
     def look_and_carry(
-        self, held: Held, pose: torch.Tensor, last: RgbdFrame | None, sources: int, slots: int,
+        self, held: Held, pose: torch.Tensor, last: LastFrames, sources: int, slots: int,
         recorded: Keyframes | None,
     ) -> tuple[Glimpse, torch.Tensor | None]:  # fmt: skip
-        """`look`, and where that knows nothing, what the `last` frame (rgb, depth, pose) shows."""
+        """`look`, and what the last frames show (see keyframes.look_and_carry)."""
         shared = Keyframes.none(self.size, pose.device) if recorded is None else recorded
         rows = held[ROWS]  # before the arena is read: what waits may be written there
         own = self._keyframes(held)

@@ -1,6 +1,9 @@
 """Carries posed RGB-D keyframes into another view: depth by a z-buffered forward splat, then colour by bilinear sampling backward.
 Keyframes that see another surface at a pixel are masked there."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 
@@ -118,14 +121,27 @@ def sight(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Where K keyframes see what the pixels of a target view show: places [B, K, H', W', 2] in their pictures, in [-1, 1], and
     agreement [B, K, H', W'], of arguments as in `warp`, with the target's pose and rotation; and how far ahead it lies of them."""
-    (batch, keys), (height, width) = depth.shape[:2], target_depth.shape[-2:]
-    points = unproject(target_depth, target[0], camera, target[1]).flatten(1, 2)
-    grid, ahead = project(points[:, None].expand(-1, keys, -1, -1), pose, grid_intrinsics(camera), turn)
-    grid, ahead = grid.view(batch * keys, height, width, 2), ahead.view(batch, keys, height, width)
-    held = F.grid_sample(depth.flatten(0, 1)[:, None], grid, mode="nearest", padding_mode="border", align_corners=False)
-    inside = _inside(grid, ahead.flatten(0, 1)).view_as(ahead)
-    agreement, near = _agreement(held.view_as(ahead), ahead, inside)
-    return grid.view(batch, keys, height, width, 2), agreement, near
+    keys = depth.shape[1]
+    points = unproject(target_depth, target[0], camera, target[1])[:, None].expand(-1, keys, -1, -1, -1)
+    places, ahead = places_in(points, pose, turn, camera)
+    agreement, near = agreement_of(planes_at(depth[:, :, None], places)[:, :, 0], places, ahead)
+    return places, agreement, near
+
+
+def places_in(
+    points: torch.Tensor, pose: torch.Tensor, turn: torch.Tensor, camera: Intrinsics
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where K pictures see points [B, K, H, W, 3], from `pose` [B, K, 7] with the rotations `turn`: places [B, K, H, W, 2] in
+    [-1, 1], and how far ahead [B, K, H, W]."""
+    places, ahead = project(points.flatten(2, 3), pose, grid_intrinsics(camera), turn)
+    return places.view(*points.shape[:-1], 2), ahead.view(points.shape[:-1])
+
+
+def planes_at(planes: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """The nearest pixels of planes [B, K, n, h, w] to `places` [B, K, H, W, 2] in [-1, 1]: [B, K, n, H, W]."""
+    given = planes.flatten(0, 1), places.flatten(0, 1)
+    held = F.grid_sample(*given, mode="nearest", padding_mode="border", align_corners=False)
+    return held.unflatten(0, places.shape[:2])
 
 
 def colours_at(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
@@ -136,13 +152,10 @@ def colours_at(rgb: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     return colour.view(*places.shape[:2], -1, *places.shape[2:4])
 
 
-def _inside(grid: torch.Tensor, ahead: torch.Tensor) -> torch.Tensor:
-    """bool [N, H, W]: which places in pictures, `grid` [N, H, W, 2] in [-1, 1], are seen, `ahead` [N, H, W] metres ahead."""
-    return (torch.linalg.vector_norm(grid, torch.inf, dim=-1) <= 1) & (ahead > NEAR_M)
-
-
-def _agreement(held: torch.Tensor, ahead: torch.Tensor, inside: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Whether depths `held` and `ahead` are of the same surface, 0..1; 0 outside the picture. And `ahead`, at least NEAR_M."""
+def agreement_of(held: torch.Tensor, places: torch.Tensor, ahead: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Whether depths `held` and `ahead` [...] are of the same surface, 0..1; 0 where `places` [..., 2] are not in the picture,
+    [-1, 1]. And `ahead`, at least NEAR_M."""
+    inside = (torch.linalg.vector_norm(places, torch.inf, dim=-1) <= 1) & (ahead > NEAR_M)
     near, most = ahead.clamp_min(NEAR_M), constant(torch.tensor, held.device, 1.5)
     return torch.addcdiv(most, (held - ahead).abs(), near, value=-1 / SAME).clamp(0, 1) * inside, near
 
@@ -186,32 +199,59 @@ def carry_things(
     source, target = (rotation(pose), pose), (rotation(target_pose), target_pose)
     flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
     each_view(splat, arrays(depth, things, *source, *target, flat, canvas), camera)
+    seen = _closed(canvas, least_around, fill_holes)  # the first closes gaps in surfaces that come nearer
     carried = torch.zeros(len(rgb), 6, *depth.shape[1:])
-    each_view(fetch, arrays(rgb, flat, things, covered, *source, _closed(canvas), *target, carried), camera)
+    each_view(fetch, arrays(rgb, flat, things, covered, *source, seen, *target, carried), camera)
     return carried
 
 
 def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) -> torch.Tensor:
     """The same as `carry_things`, in plain tensor algebra, also for GPUs and gradients."""
-    height, width = depth.shape[-2:]
-    size, flat = depth.shape[-2:], _flattened(depth, things)
-    turn, target_turn = rotation(pose), rotation(target_pose)
-    points = unproject(flat, pose, camera, turn).flatten(1, 2)
-    seen = _closed(splat_depth(points, target_pose, camera, size, target_turn))
-    points = unproject(seen, target_pose, camera, target_turn).flatten(1, 2)
-    grid, ahead = project(points, pose, grid_intrinsics(camera), turn)
-    grid, ahead = grid.view(-1, *size, 2), ahead.view(-1, *size)
-    planes = torch.cat([rgb / 255, *(part[:, None] for part in (things, flat, covered))], 1)
-    carried = F.grid_sample(planes, grid, mode="nearest", padding_mode="border", align_corners=False)
-    trust = _agreement(carried[:, 4], ahead, _inside(grid, ahead) & (carried[:, 5] < 0.5))[0][:, None]
+    frames = MovingFrames(*(part[:, None] for part in (rgb, depth, things, covered, pose)))
+    turn, target = rotation(frames.pose), (target_pose, rotation(target_pose))
+    planes, seen = splat_frames(frames, turn, target, camera)
+    seen = torch.where(seen < FAR_M, seen, fill_holes(seen[:, 0])[:, None])
+    places, ahead = places_in(unproject(seen, target[0], camera, target[1]), frames.pose, turn, camera)
+    carried = planes_at(planes, places)
+    return moved(carried, agreement_of(carried[:, :, 4], places, ahead)[0], seen)[:, 0]
+
+
+class MovingFrames(NamedTuple):
+    """K frames of each view in which something may move, as `carry_things` takes them: [B, K, ...] each."""
+
+    rgb: torch.Tensor
+    depth: torch.Tensor
+    things: torch.Tensor
+    covered: torch.Tensor
+    pose: torch.Tensor
+
+
+def splat_frames(
+    frames: MovingFrames, turn: torch.Tensor, target: tuple[torch.Tensor, torch.Tensor], camera: Intrinsics
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The planes [B, K, 6, H, W] of frames from which colours are taken, the fifth their depth with things made flat; and that depth
+    [B, K, H, W] in the views from the pose and rotation `target`, FAR_M in holes. turn: the rotations of the frames."""
+    rgb, depth, things, covered, pose = frames
+    keys, size = depth.shape[1], depth.shape[-2:]
+    flat = _flattened(depth.flatten(0, 1), things.flatten(0, 1)).view_as(depth)
+    points = unproject(flat, pose, camera, turn).flatten(0, 1).flatten(1, 2)
+    targets = (part[:, None].expand(-1, keys, *part.shape[1:]).flatten(0, 1) for part in target)
+    place, toward = targets
+    seen = _closed(splat_depth(points, place, camera, size, toward), least_around_slowly)
+    planes = torch.cat([rgb / 255, *(part[:, :, None] for part in (things, flat, covered))], 2)
+    return planes, seen.view_as(depth)
+
+
+def moved(carried: torch.Tensor, agreement: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+    """Frames as `carry_things` gives them [B, K, 6, H, W]: from their planes in a view, their agreement with it and its depth."""
+    trust = (agreement * (carried[:, :, 5] < 0.5))[:, :, None]
     carried = carried * (trust > 0)
-    return torch.cat([carried[:, :3], trust, seen[:, None], carried[:, 3:4]], 1)
+    return torch.cat([carried[:, :, :3], trust, seen[:, :, None], carried[:, :, 3:4]], 2)
 
 
-def _closed(depth: torch.Tensor) -> torch.Tensor:
-    """Depth [B, H, W] with FAR_M in holes -> the same without."""
-    around = least_around if kernels_do(depth) else least_around_slowly
-    for way in (around, fill_holes):  # the first closes gaps in surfaces that come nearer
+def _closed(depth: torch.Tensor, *ways: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+    """Depth [B, H, W] with what the `ways` give in place of FAR_M, one after the other."""
+    for way in ways:
         depth = torch.where(depth < FAR_M, depth, way(depth))
     return depth
 

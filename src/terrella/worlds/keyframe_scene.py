@@ -23,8 +23,8 @@ from ..space.keyframes import Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table
 from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
-from ..space.reproject import fill_holes
-from .carried_frames import Frame, carry_frames, covered_pixels, static_depth
+from ..space.reproject import MovingFrames, fill_holes
+from .carried_frames import covered_pixels, static_depth
 from .config import KeyframesConfig
 from .generator import Conditioning, DrawnFrame, context_thumbnail
 from .localisation import localise
@@ -214,16 +214,14 @@ class KeyframeScene:
     def look(self, state: State, before: State) -> Conditioning:
         """What is known of the view from the state's pose; `before` has the last frame."""
         config, pose = self.config, state["pose"]
-        last = None if config.moving else (before["rgb"], before["depth"], before["pose"])
+        last = _moving_frames(before) if config.moving else (before["rgb"], before["depth"], before["pose"])
         glimpse, carried = self.own.look_and_carry(state, pose, last, config.sources, config.slots, self.recorded)
         context, familiar = context_thumbnail(before["rgb"]), self._familiar(state)
-        if carried is not None:
-            return Conditioning(glimpse, carried, context, familiar)
-        last, earlier = ([before[f"{age}{part}"] for part in SEEN] for age in ("", "earlier_"))
-        covered = covered_pixels(torch.cat([last[4], earlier[4]]), torch.cat([last[2], earlier[2]])).chunk(2)
-        frames = Frame._make([*last[:4], covered[0]]), Frame._make([*earlier[:4], covered[1]])
-        context = torch.cat([context, state["actions"].flatten(1)], 1)
-        return Conditioning(glimpse, carry_frames(frames[0], frames[1], pose, config.camera), context, familiar)
+        assert carried is not None
+        if config.moving:
+            carried = torch.cat([carried[:, 0], carried[:, 1, :4]], 1)  # as carry_frames gives them
+            context = torch.cat([context, state["actions"].flatten(1)], 1)
+        return Conditioning(glimpse, carried, context, familiar)
 
     def _familiar(self, state: State) -> torch.Tensor:
         """How well the place is known [B, 2]: distance to the nearest recorded keyframe, log(1 + metres), a radian counting as
@@ -262,6 +260,14 @@ class KeyframeScene:
     def _lasting(self, state: State) -> torch.Tensor:
         """The frame's depth as a keyframe keeps it."""
         return static_depth(state["depth"], state["things"]) if self.config.moving else state["depth"]
+
+
+def _moving_frames(before: State) -> MovingFrames:
+    """The last frame of a state and the one before it, [B, 2, ...] each."""
+    ages = [[before[f"{age}{part}"] for part in SEEN] for age in ("", "earlier_")]
+    rgb, depth, things, pose, instances = (torch.stack(parts, 1) for parts in zip(*ages))
+    covered = covered_pixels(instances.flatten(0, 1), things.flatten(0, 1)).view_as(things)
+    return MovingFrames(rgb, depth, things, covered, pose)
 
 
 def _cell_codes(places: torch.Tensor) -> torch.Tensor:

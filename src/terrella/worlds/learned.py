@@ -215,7 +215,8 @@ class LearnedWorld:
         state = self._observed(evidence, observation, prior)
         if not evidence.seen:
             assert prior is not None
-            state = state.replace(**self.objects.step(prior, state, seeds), gone=drift(prior, state, led=True))
+            objects = self.objects.step(prior, state, chance.uniforms(seeds, self.objects.draws))
+            state = state.replace(**objects, gone=drift(prior, state, led=True))
             return self._draw(state, prior, seeds, torch.zeros_like(state["done"]))
         return state if evidence.lone is None else self._judged(state, evidence.lone, seeds)
 
@@ -229,9 +230,10 @@ class LearnedWorld:
         """The part of `imagine` that is tensors alone: by actions [B, A] of `controls.encode` and seeds int64 [B]."""
         state, after = self.move(state, numbers)
         still, ends = state["done"], self.body.ends(after, numbers)
-        after = after.replace(**self.objects.step(state, after, seeds), gone=drift(state, after, led=False))
+        chances = chance.uniforms(seeds, {**self.objects.draws, **self.outcome.draws})
+        after = after.replace(**self.objects.step(state, after, chances), gone=drift(state, after, led=False))
         after = self._draw(after, state, seeds, still)
-        after = after.replace(**self.outcome.step(state, after, ends, numbers, seeds))
+        after = after.replace(**self.outcome.step(state, after, ends, numbers, chances))
         others = [name for name in after if name not in (*self._drawn_names, "reward")]
         kept = _where(still, state, after, [name for name in others if after[name] is not state[name]])
         nothing = constant(torch.tensor, self.device, 0.0)

@@ -140,9 +140,14 @@ class Billboards(nn.Module):
         billboards = self.match_evidence(cut, listed, none if prior is None else prior["billboards_before"])
         return {"billboards": billboards, "billboards_before": billboards, "instances": instances}
 
-    def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
+    @property
+    def draws(self) -> Mapping[int, Sequence[int]]:
+        """See parts.Objects."""
+        return dict.fromkeys((LOOKS, MOVES, GOES), (self.config.rows,))
+
+    def step(self, before: State, after: State, chances: Mapping[int, torch.Tensor]) -> Tensors:
         """The billboards of `after`, a step after `before`: those that were in sight have acted."""
-        billboards = self.act(before["billboards"], in_sight(before), after["pose"], after["actions"], seeds)
+        billboards = self.act(before["billboards"], in_sight(before), after["pose"], after["actions"], chances)
         return {"billboards": billboards, "billboards_before": before["billboards"]}
 
     def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:
@@ -214,21 +219,25 @@ class Billboards(nn.Module):
         return BillboardLogits(next_look, self.next_move(known), self.goes(known)[:, 0])
 
     def act(
-        self, billboards: torch.Tensor, seen: torch.Tensor, pose: torch.Tensor, acts: torch.Tensor, seeds: torch.Tensor
+        self,
+        billboards: torch.Tensor,
+        seen: torch.Tensor,
+        pose: torch.Tensor,
+        acts: torch.Tensor,
+        chances: Mapping[int, torch.Tensor],
     ) -> torch.Tensor:
-        """The billboards [B, K, COLUMNS] one step later, sampled by seeds [B] (core/chance.py). seen bool [B, K]: the others wait;
+        """The billboards [B, K, COLUMNS] one step later, sampled by random numbers of `draws`. seen bool [B, K]: the others wait;
         pose [B, 7] and acts [B, history, A] as for `next_logits`."""
         rows = billboards.shape[1]
         flat = billboards.flatten(0, 1)
         logits = self.next_logits(flat, pose.repeat_interleave(rows, 0), acts.repeat_interleave(rows, 0))
         likely = logits.look.softmax(1)
         likely = likely.masked_fill(likely < likely.amax(1, keepdim=True).clamp_max(UNLIKELY), 0.0)
-        points = chance.uniforms(seeds, dict.fromkeys((LOOKS, MOVES, GOES), (rows,)))
         drawn = [
-            chance.chosen(points[stream], part.unflatten(0, (-1, rows))).flatten()
+            chance.chosen(chances[stream], part.unflatten(0, (-1, rows))).flatten()
             for part, stream in ((likely, LOOKS), (logits.move.softmax(1), MOVES))
         ]
-        gone = points[GOES] < logits.gone.sigmoid().unflatten(0, (-1, rows))
+        gone = chances[GOES] < logits.gone.sigmoid().unflatten(0, (-1, rows))
         after = update_billboards(flat, flat[:, PLACE] + self.moves[drawn[1]], drawn[0].float())
         after = after.unflatten(0, (-1, rows)).masked_fill(gone[..., None], 0.0)
         return torch.where((seen & (billboards[..., NUMBER] > 0))[..., None], after, billboards)
@@ -305,7 +314,7 @@ class NoObjects(Absent):
     ) -> Tensors:
         return {}
 
-    def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
+    def step(self, before: State, after: State, chances: Mapping[int, torch.Tensor]) -> Tensors:
         return {}
 
     def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:

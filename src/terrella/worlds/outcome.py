@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple, final
 
 import numpy as np
@@ -36,6 +37,7 @@ class ConstantOutcome:
 
     kind = "constant"
     begins: tuple[float, ...] = ()
+    draws: Mapping[int, Sequence[int]] = MappingProxyType({})
 
     def __init__(self, config: ConstantConfig):
         self.config = config
@@ -50,7 +52,7 @@ class ConstantOutcome:
         return _going(evidence)
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
+        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
         """Reward and end of a step that `ends` [B] or does not; no frame is read."""
         usual, last = (
@@ -121,6 +123,11 @@ class FrameOutcome(nn.Module):
         self.changed = nn.ModuleList(nn.Linear(inner, len(levels)) for levels in config.changes)
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
+    @property
+    def draws(self) -> Mapping[int, Sequence[int]]:
+        """See parts.Outcome."""
+        return {CHANGES + column: () for column in range(len(self.config.vitals))}
+
     def begin(self, batch: int) -> torch.Tensor:
         """The hidden state of a new episode: [batch, hidden]."""
         return self.rewards.new_zeros(batch, self.config.hidden)
@@ -149,11 +156,11 @@ class FrameOutcome(nn.Module):
         return {**_going(evidence), **begun, "vitals": vitals}
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
+        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
         """Reward, end and vitals as they are read off the frames before and after the step; where the body ends is ignored."""
         frames = newest_frame(before), newest_frame(after)
-        outcome = self(*frames, action, before["vitals"], before["hidden"], seeds)
+        outcome = self(*frames, action, before["vitals"], before["hidden"], chances)
         return {**outcome._asdict(), "done": outcome.done > 0}
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
@@ -192,16 +199,16 @@ class FrameOutcome(nn.Module):
         action: torch.Tensor,
         vitals: torch.Tensor,
         hidden: torch.Tensor,
-        seeds: torch.Tensor | None = None,
+        chances: Mapping[int, torch.Tensor] | None = None,
     ) -> OutcomePrediction:
-        """The outcome of a step; arguments as for `seen` and `judge`. With `seeds` [B] (core/chance.py) the changes of vitals are
+        """The outcome of a step; arguments as for `seen` and `judge`. With random numbers of `draws` the changes of vitals are
         sampled; without, they are the likeliest."""
         read = self.judge(self.seen(before, after), action, vitals, hidden)
         reward = (read.reward.float().softmax(1) * self.rewards).sum(1)
         changes = []
         for column, (logits, values) in enumerate(zip(read.changes, self.config.changes)):
-            levels, chances = constant(torch.tensor, logits.device, values), logits.float().softmax(1)
-            picked = logits.argmax(1) if seeds is None else chance.choice(seeds, chances, stream=CHANGES + column)
+            levels, likely = constant(torch.tensor, logits.device, values), logits.float().softmax(1)
+            picked = logits.argmax(1) if chances is None else chance.chosen(chances[CHANGES + column], likely)
             changes.append(levels[picked])
         left = vitals.float() + torch.stack(changes, 1) if changes else vitals
         return OutcomePrediction(reward, self.ends(read.known, left).float(), left, read.hidden.float())

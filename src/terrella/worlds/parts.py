@@ -10,6 +10,7 @@ which is falsy and adds nothing to a state.
 # pyright: reportReturnType=false
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import torch
@@ -142,7 +143,9 @@ class Generator(WorldPart, Protocol):
 
 @runtime_checkable
 class Objects(WorldPart, Protocol):
-    """Things that move by themselves."""
+    """Things that move by themselves. draws: the shapes of the random numbers of a step, by their streams."""
+
+    draws: Mapping[int, Sequence[int]]
 
     def channels(self, size: tuple[int, int]) -> Channels: ...
     def start(self, pick: torch.Tensor, state: State) -> Tensors:
@@ -157,8 +160,8 @@ class Objects(WorldPart, Protocol):
     ) -> Tensors:
         """The objects that the evidence shows."""
 
-    def step(self, before: State, after: State, seeds: torch.Tensor) -> Tensors:
-        """The objects one step on, by chance from the seeds [B]."""
+    def step(self, before: State, after: State, chances: Mapping[int, torch.Tensor]) -> Tensors:
+        """The objects one step on, by random numbers of `draws` (core/chance.uniforms)."""
 
     def add_walls(self, walls: Walls, state: State, half_m: float) -> Walls:
         """The walls, and the sides of objects that stop a body of this half width."""
@@ -171,19 +174,21 @@ class Objects(WorldPart, Protocol):
 
 @runtime_checkable
 class Outcome(WorldPart, Protocol):
-    """What a step brings beside its frame: reward float32 [B], done bool [B], vitals. begins: vitals of a new episode."""
+    """What a step brings beside its frame: reward float32 [B], done bool [B], vitals. begins: vitals of a new episode; draws: as of
+    Objects."""
 
     begins: tuple[float, ...]
+    draws: Mapping[int, Sequence[int]]
 
     def channels(self) -> Channels: ...
     def observe(self, prior: State | None, evidence: Evidence, observation: Mapping[str, torch.Tensor]) -> Tensors:
         """An episode that goes on, with the vitals that are observed."""
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, seeds: torch.Tensor
+        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
-        """The outcome of the step by action [B, A]; ends [B]: whether the body says that the episode ends there. Frames are
-        drawn only if they are read."""
+        """The outcome of the step by action [B, A]; ends [B]: whether the body says that the episode ends there; chances: random
+        numbers of `draws`. Frames are drawn only if they are read."""
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors: ...
 
@@ -203,6 +208,7 @@ class Absent:
 
     kind: str = "none"
     config: Any = None
+    draws: Mapping[int, Sequence[int]] = MappingProxyType({})
 
     def __bool__(self) -> bool:
         return False
