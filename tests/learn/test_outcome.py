@@ -10,7 +10,7 @@ import torch
 from gymnasium import spaces
 from tests.learn.stopping import quiet
 
-from terrella.core import check_world, make_rng
+from terrella.core import chance, check_world, make_rng
 from terrella.data import ClipCache, Recorder
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
@@ -182,7 +182,9 @@ def test_a_dream_pays_costs_lives_and_ends(learned):
     numbers = world.controls.encode(torch.tensor([1, 2]))
     drawn = world.observe({"rgb": after, "lives": torch.tensor([1.0, 3.0])}, state, rng)  # as if it had been dreamt
     nobody, seeds = torch.zeros(2, dtype=torch.bool), torch.zeros(2, dtype=torch.int64)
-    then = drawn.replace(**world.outcome.step(state, drawn, nobody, numbers, seeds))
+    then = drawn.replace(
+        **world.outcome.step(state, drawn, lambda: nobody, numbers, chance.uniforms(seeds, world.outcome.draws))
+    )
     assert then["vitals"][:, 0].tolist() == [0.0, 3.0] and then["done"].tolist() == [True, False]
     assert then["reward"][1] > 1.5 and then["reward"][0] < 0.5
     still = world.imagine(then, torch.tensor([2, 2]), rng)

@@ -231,11 +231,11 @@ def test_a_generator_draws_by_its_noise(world):
 
 def test_objects_start_act_are_painted_and_stop_bodies(world):
     objects, (before, after, _) = world.objects, walked(world)
-    camera, seeds = world.scene.camera, chance.seeds(B, make_rng(0))
+    camera, chances = world.scene.camera, chance.uniforms(chance.seeds(B, make_rng(0)), objects.draws)
     entries(objects.start(torch.zeros(B, dtype=torch.long), before), before)
-    step = objects.step(before, after, seeds)
+    step = objects.step(before, after, chances)
     entries(step, before)
-    assert all(torch.equal(part, objects.step(before, after, seeds)[name]) for name, part in step.items())
+    assert all(torch.equal(part, objects.step(before, after, chances)[name]) for name, part in step.items())
     none = Walls(torch.zeros(0, 4), torch.zeros(B, 0, 4))
     assert objects.add_walls(none, before, 0.1).own.shape[::2] == (B, 4)
     if objects:
@@ -263,7 +263,8 @@ def test_an_outcome_begins_steps_and_renders(world):
     assert len(outcome.begins) == begun.get("vitals", torch.zeros(B, 0)).shape[1]
     drawn = world.imagine(before, world.spec.sample_action(B, make_rng(0)), make_rng(0))
     ends = torch.tensor([True, False, False])
-    step = outcome.step(before, drawn, ends, numbers, chance.seeds(B, make_rng(0)))
+    chances = chance.uniforms(chance.seeds(B, make_rng(0)), outcome.draws)
+    step = outcome.step(before, drawn, lambda: ends, numbers, chances)
     entries(step, before)
     if outcome.kind == "constant":
         usual, ending = outcome.config.usual, outcome.config.ending

@@ -111,7 +111,7 @@ def paint_billboards_slowly(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """The same as `paint_billboards`, in plain tensor algebra, all billboards of all views at once; also for GPUs."""
     (batch, height, width), count = depth.shape, billboards[0].shape[1]
-    order, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
+    farthest, present, sides, far = _placed(billboards, present, pose, camera, (height, width))
     pictures = billboards[1].flatten(0, 1)
     quarters = constant(_quarters, rgb.device, 2 * max(height, width))
     first, last = sides.clamp(-1e6, 1e6).view(batch, count, 2, 2, 1).unbind(3)
@@ -125,18 +125,17 @@ def paint_billboards_slowly(
     shown = (far[..., None, None] < (depth + BEHIND_M)[:, None]) & present[..., None, None]
     small = small * shown[:, :, None]
     # the nearest first; what is left of each after those before it
-    order = order.flip(1)
+    order = farthest.flip(1)
     small = small.gather(1, order[..., None, None, None].expand_as(small))
     colour, cover = small[:, :, :3], small[:, :, 3]
     left = F.pad((1 - cover).cumprod(1), (0, 0, 0, 0, 1, 0), value=1.0)
     rgb = torch.addcmul((colour * left[:, :-1, None]).sum(1), rgb, left[:, -1:])
     ranks = constant(torch.arange, rgb.device, count, 0, -1)[:, None, None]
     least = constant(torch.tensor, rgb.device, (0.5, TOUCHED))[:, None, None, None, None]
-    onto, touched = ((cover > least) * ranks).amax(2)  # by how near they are, 0 for none
-    depths, numbers = F.pad(far.gather(1, order), (0, 1)).flip(1), F.pad(order + 1, (0, 1)).flip(1)
-    nearest = depths.gather(1, onto.flatten(1)).view_as(depth)
-    instances = numbers.gather(1, touched.flatten(1)).view_as(depth).to(torch.uint8)
-    return rgb, torch.where(onto > 0, nearest, depth), instances
+    ranked = ((cover > least) * ranks).amax(2)  # by how near they are, 0 for none
+    listed = F.pad(torch.stack([far.gather(1, farthest), farthest + 1]), (1, 0))  # depths and numbers, none first
+    nearest, instances = listed.gather(2, ranked.flatten(2)).view_as(ranked)
+    return rgb, torch.where(ranked[0] > 0, nearest, depth), instances.to(torch.uint8)
 
 
 def _quarters(count: int) -> torch.Tensor:

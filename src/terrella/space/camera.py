@@ -66,8 +66,8 @@ def _products(pose: torch.Tensor) -> torch.Tensor:
 def unproject(
     depth: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, turn: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """Depth [..., H, W] seen from `pose` [..., 7], whose rotations are `turn` [..., 3, 3] -> world points [..., H, W, 3]. Of V depth
-    images from each pose, [..., V, H, W], points [..., V, H, W, 3]."""
+    """Depth [..., H, W] seen from `pose` [..., 7], whose rotations are `turn` [..., 3, 3] -> world points [..., H, W, 3]; of V
+    depth images from each pose, [..., V, H, W], points [..., V, H, W, 3]."""
     points = (depth[..., None] * rays(camera, *depth.shape[-2:], device=depth.device)).flatten(pose.ndim - 1, -2)
     turn = rotation(pose) if turn is None else turn
     eye, turn = pose[..., None, :3].reshape(-1, 1, 3), turn.mT.reshape(-1, 3, 3)

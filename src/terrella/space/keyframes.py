@@ -17,7 +17,7 @@ from .camera import FAR_M, NEAR_M, SAME, Intrinsics, pixel_intrinsics, pixels_at
 from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
-from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, patch_count, patches, patches_slowly
+from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, cast_inverse, patch_count, patches, patches_slowly
 from .reproject import (
     MovingFrames,
     agreement_of,
@@ -25,6 +25,7 @@ from .reproject import (
     carry_unknown,
     colours_at,
     fill_holes,
+    filled_inverse,
     moved,
     places_in,
     planes_at,
@@ -254,8 +255,8 @@ def look_and_carry(
     shared: Keyframes, picks: torch.Tensor, pose: torch.Tensor, camera: Intrinsics, size: tuple[int, int], slots: int,
     own: Keyframes | None = None, last: LastFrames = None,
 ) -> tuple[Glimpse, torch.Tensor | None]:  # fmt: skip
-    """`look`; and where that knows nothing, what the `last` frame (rgb, depth, pose) shows, as `carry_unknown` gives it; of K moving
-    frames, what `carry_things` gives, [B, K, 6, H, W]."""
+    """`look`; and where that knows nothing, what the `last` frame (rgb, depth, pose) shows, as `carry_unknown` gives it; of K
+    moving frames, what `carry_things` gives, [B, K, 6, H, W]."""
     own = Keyframes.none(size, pose.device) if own is None else own
     if not kernels_do(pose):
         return look_slowly(shared, picks, pose, camera, size, slots, own, last)
@@ -321,19 +322,20 @@ def look_slowly(
     if len(shared):
         patch = chosen(patch, shared.fine)
     patch = patch * valid[..., None, None]
-    depth = cast(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
-    hit = depth < FAR_M
+    inverse = cast_inverse(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
+    hit = inverse > 0
     # the last frame is one keyframe more, and moving frames are ones more, in views of their own, whose colours are taken apart
     if moving is None:
         key_depth = key_depth if last is None else torch.cat([key_depth, last[1][:, None]], 1)
-        depth = fill_holes(depth)
+        depth = filled_inverse(inverse).reciprocal()
         places, agreement, near = sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera)
     else:
         planes, splat = splat_frames(moving, turns[:, keys:-1], (pose, turn), camera)
-        filled = fill_holes(torch.cat([depth[:, None], splat], 1).flatten(0, 1)).unflatten(0, (batch, -1))
-        seen = torch.where(splat < FAR_M, splat, filled[:, 1:])
-        depth = filled[:, 0]
-        points = unproject(torch.cat([depth[:, None].expand(-1, keys, -1, -1), seen], 1), pose, camera, turn)
+        filled = filled_inverse(torch.cat([inverse[:, None], splat], 1).flatten(0, 1)).unflatten(0, (batch, -1))
+        seen = torch.where(splat > 0, splat, filled[:, 1:])
+        depths = torch.cat([filled[:, :1].expand(-1, keys, -1, -1), seen], 1).reciprocal()
+        depth, seen = depths[:, 0], depths[:, keys:]
+        points = unproject(depths, pose, camera, turn)
         places, ahead = places_in(points, viewers[:, :-1], turns[:, :-1], camera)
         carried = planes_at(planes, places[:, keys:])
         held = torch.cat([planes_at(key_depth[:, :, None], places[:, :keys]), carried[:, :, 4:5]], 1)[:, :, 0]

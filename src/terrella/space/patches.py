@@ -108,7 +108,19 @@ def cast(
     turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], whose rotations are `turn` [B, 3, 3], FAR_M where there is none: in
-    plain tensor algebra, for all devices.
+    plain tensor algebra, for all devices."""
+    return cast_inverse(patch, pose, camera, size, steps, turn).reciprocal().clamp_max(FAR_M)
+
+
+def cast_inverse(
+    patch: torch.Tensor,
+    pose: torch.Tensor,
+    camera: Intrinsics,
+    size: tuple[int, int],
+    steps=FINE_CASTS,
+    turn: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """1 / depth as `cast` gives it, 0 where there is none.
 
     Patches are tried at the first pixels of the boxes around their pictures, in `steps` of fixed sizes, so that no shape depends on
     a value: few pixels of all, more of the largest, all of the very largest. What does not fit is left out."""
@@ -140,7 +152,7 @@ def cast(
     for many, tried in steps:
         part = boxes if many >= count else boxes.gather(1, largest[:, :many])
         _cast_boxes(part, min(tried, height * width), canvas)
-    return canvas[:, :-OUTSIDE].reciprocal().clamp_max(FAR_M).view(batch, height, width)
+    return canvas[:, :-OUTSIDE].view(batch, height, width)
 
 
 # Linear functions of a pixel: its number, 1 / depth of the plane there, then those that are above 0 in the patch and in its box.

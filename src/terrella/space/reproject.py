@@ -1,7 +1,6 @@
 """Carries posed RGB-D keyframes into another view: depth by a z-buffered forward splat, then colour by bilinear sampling backward.
 Keyframes that see another surface at a pixel are masked there."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -27,22 +26,22 @@ from .kernels_numba.planes import fill
 from .views import arrays, each_view
 
 
-def splat_depth(
+def splat_inverse(
     points: torch.Tensor,
     pose: torch.Tensor,
     camera: Intrinsics,
     size: tuple[int, int],
     turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """World points [B, N, 3] -> nearest depth for each pixel of the view from `pose` [B, 7], whose rotations are `turn`
-    [B, 3, 3]: [B, H, W], FAR_M in holes."""
+    """World points [B, N, 3] -> 1 / depth of the nearest for each pixel of the view from `pose` [B, 7], whose rotations are `turn`
+    [B, 3, 3]: [B, H, W], 0 in holes."""
     height, width = size
     at, depth = project(points, pose, pixel_intrinsics(camera, size), turn)
     pixel, inside = pixels_at(at, size)
     aside = constant(cells_outside, depth.device, depth.shape[1], height * width + OUTSIDE)
     pixel = torch.where(inside & (depth > 0.05), pixel, aside)
-    canvas = depth.new_full((len(points), height * width + OUTSIDE), FAR_M)
-    canvas.scatter_reduce_(1, pixel, depth, "amin")
+    canvas = depth.new_zeros(len(points), height * width + OUTSIDE)
+    canvas.scatter_reduce_(1, pixel, depth.reciprocal(), "amax")
     return canvas[:, :-OUTSIDE].view(-1, height, width)
 
 
@@ -51,11 +50,6 @@ def least_around(plane: torch.Tensor) -> torch.Tensor:
     padded = F.pad(plane, (1, 1, 1, 1), value=torch.inf)
     lines = torch.minimum(torch.minimum(padded[:, :-2], padded[:, 2:]), padded[:, 1:-1])
     return torch.minimum(torch.minimum(lines[..., :-2], lines[..., 2:]), lines[..., 1:-1])
-
-
-def least_around_slowly(plane: torch.Tensor) -> torch.Tensor:
-    """The same as `least_around` in fewer operators, for GPUs and gradients."""
-    return -F.max_pool2d(-plane, 3, 1, 1)
 
 
 def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
@@ -69,12 +63,17 @@ def fill_holes(depth: torch.Tensor, levels: int = 5) -> torch.Tensor:
 
 def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     """The same as `fill_holes`, in plain tensor algebra, also for GPUs and gradients."""
-    inverse = depth.reciprocal()[:, None]
+    return filled_inverse(depth.reciprocal() * (depth < FAR_M), levels).reciprocal()
+
+
+def filled_inverse(inverse: torch.Tensor, levels: int = 5) -> torch.Tensor:
+    """1 / depth [B, H, W] with holes (0) filled as `fill_holes` does, of at most FAR_M."""
+    inverse = inverse[:, None]
     near = F.max_pool2d(inverse, 3, 1, 1)
-    ratio = depth[:, None] * near
+    ratio = near / inverse.clamp_min(1 / FAR_M)
     count = F.avg_pool2d((ratio < 1.15).float(), 3, 1, 1)
     inverse = torch.where((ratio > 1.3) & (count > 0.55), near, inverse)
-    seen = inverse > 1.0001 / FAR_M  # a compiler may round divisions
+    seen = inverse > 0
     stack = [torch.cat([inverse * seen, seen], 1)]
     for _ in range(levels):
         stack.append(F.avg_pool2d(stack[-1], 2, ceil_mode=True))
@@ -86,7 +85,7 @@ def fill_holes_slowly(depth: torch.Tensor, levels: int) -> torch.Tensor:
     for mean, valid, size in zip(means[-2::-1], known[-2::-1], sizes[-2::-1]):
         coarse = F.interpolate(filled, size=size, mode="bilinear", align_corners=False)
         filled = torch.where(valid.unflatten(2, size), mean.unflatten(2, size), coarse)
-    return filled[:, 0].clamp_min(1 / FAR_M).reciprocal()
+    return filled[:, 0].clamp_min(1 / FAR_M)
 
 
 def warp(
@@ -199,7 +198,9 @@ def carry_things(
     source, target = (rotation(pose), pose), (rotation(target_pose), target_pose)
     flat, canvas = torch.empty(depth.shape), torch.full(depth.shape, FAR_M)
     each_view(splat, arrays(depth, things, *source, *target, flat, canvas), camera)
-    seen = _closed(canvas, least_around, fill_holes)  # the first closes gaps in surfaces that come nearer
+    seen = canvas
+    for way in (least_around, fill_holes):  # the first closes gaps in surfaces that come nearer
+        seen = torch.where(seen < FAR_M, seen, way(seen))
     carried = torch.zeros(len(rgb), 6, *depth.shape[1:])
     each_view(fetch, arrays(rgb, flat, things, covered, *source, seen, *target, carried), camera)
     return carried
@@ -209,8 +210,8 @@ def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) 
     """The same as `carry_things`, in plain tensor algebra, also for GPUs and gradients."""
     frames = MovingFrames(*(part[:, None] for part in (rgb, depth, things, covered, pose)))
     turn, target = rotation(frames.pose), (target_pose, rotation(target_pose))
-    planes, seen = splat_frames(frames, turn, target, camera)
-    seen = torch.where(seen < FAR_M, seen, fill_holes(seen[:, 0])[:, None])
+    planes, inverse = splat_frames(frames, turn, target, camera)
+    seen = torch.where(inverse > 0, inverse, filled_inverse(inverse[:, 0])[:, None]).reciprocal()
     places, ahead = places_in(unproject(seen, target[0], camera, target[1]), frames.pose, turn, camera)
     carried = planes_at(planes, places)
     return moved(carried, agreement_of(carried[:, :, 4], places, ahead)[0], seen)[:, 0]
@@ -229,15 +230,16 @@ class MovingFrames(NamedTuple):
 def splat_frames(
     frames: MovingFrames, turn: torch.Tensor, target: tuple[torch.Tensor, torch.Tensor], camera: Intrinsics
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The planes [B, K, 6, H, W] of frames from which colours are taken, the fifth their depth with things made flat; and that depth
-    [B, K, H, W] in the views from the pose and rotation `target`, FAR_M in holes. turn: the rotations of the frames."""
+    """The planes [B, K, 6, H, W] of frames from which colours are taken, the fifth their depth with things made flat; and 1 / this
+    depth [B, K, H, W] in the views from the pose and rotation `target`, 0 in holes. turn: the rotations of the frames."""
     rgb, depth, things, covered, pose = frames
     keys, size = depth.shape[1], depth.shape[-2:]
     flat = _flattened(depth.flatten(0, 1), things.flatten(0, 1)).view_as(depth)
     points = unproject(flat, pose, camera, turn).flatten(0, 1).flatten(1, 2)
     targets = (part[:, None].expand(-1, keys, *part.shape[1:]).flatten(0, 1) for part in target)
     place, toward = targets
-    seen = _closed(splat_depth(points, place, camera, size, toward), least_around_slowly)
+    seen = splat_inverse(points, place, camera, size, toward)
+    seen = torch.where(seen > 0, seen, F.max_pool2d(seen, 3, 1, 1))  # closes gaps in surfaces that come nearer
     planes = torch.cat([rgb / 255, *(part[:, :, None] for part in (things, flat, covered))], 2)
     return planes, seen.view_as(depth)
 
@@ -247,13 +249,6 @@ def moved(carried: torch.Tensor, agreement: torch.Tensor, seen: torch.Tensor) ->
     trust = (agreement * (carried[:, :, 5] < 0.5))[:, :, None]
     carried = carried * (trust > 0)
     return torch.cat([carried[:, :, :3], trust, seen[:, :, None], carried[:, :, 3:4]], 2)
-
-
-def _closed(depth: torch.Tensor, *ways: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
-    """Depth [B, H, W] with what the `ways` give in place of FAR_M, one after the other."""
-    for way in ways:
-        depth = torch.where(depth < FAR_M, depth, way(depth))
-    return depth
 
 
 def _flattened(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:

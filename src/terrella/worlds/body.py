@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import copy
+import math
 from typing import final
 
 import torch
 from torch import nn
 
-from ..core.backend import constant, table, where
+from ..core.backend import constant, derived, where
 from ..core.spec import POSE, POSE_UNIT
 from ..core.state import State
 from ..space.camera import planar_pose, yaw
@@ -40,7 +41,7 @@ class Motion(nn.Module):
     def forward(self, heading, speed, actions):
         """heading [B] radians; speed [B, 2] metres a step, world frame; actions [B, history + 1, A], the newest last.
         Returns the new heading [B] and the displacement that this step wishes for [B, 2]."""
-        heading = heading + 0.1 * self.turn(actions.flatten(1))[:, 0]
+        heading = torch.add(heading, self.turn(actions.flatten(1))[:, 0], alpha=0.1)
         glide = self.glide(torch.cat([10 * rotate(speed, -heading), actions[:, -1]], -1))
         return heading, 0.1 * rotate(glide, heading)
 
@@ -120,17 +121,21 @@ def follow_stairs(levels: torch.Tensor, before: torch.Tensor, after: torch.Tenso
     places around, `levels` [K, 3], do, as far as a step up or down leads there, and leans towards them as it walks."""
     near = torch.cdist(torch.stack([before, after]), levels[:, :2])  # [2, B, K]
     level = (levels[:, 2] - z[:, None]).abs() < 1.5
-    weight = (near.square() + 0.01).square().reciprocal() * ((near < 2.5) & level)
-    total, high = weight.sum(2), (weight * levels[:, 2]).sum(2)
-    reached = torch.where(total > 0, high / total.clamp_min(1e-9), z)
-    lean = (0.5 * torch.linalg.vector_norm(after - before, dim=-1)).clamp(max=1.0)
-    return z + torch.addcmul(reached[1] - reached[0], lean, reached[1] - z).clamp(-0.3, 0.3)
+    weight = torch.addcmul(constant(torch.tensor, z.device, 0.01), near, near).pow(-2) * ((near < 2.5) & level)
+    total, high = (weight @ derived(_ones_and_heights, levels)).unbind(2)
+    reached = torch.add(high, z, alpha=1e-9) / (total + 1e-9)  # where nothing is near, z
+    lean = torch.linalg.vector_norm(after - before, dim=-1).clamp_max(2)
+    return z + torch.addcmul(reached[1] - reached[0], lean, reached[1] - z, value=0.5).clamp(-0.3, 0.3)
+
+
+def _ones_and_heights(levels: torch.Tensor) -> torch.Tensor:
+    return torch.stack([torch.ones_like(levels[:, 2]), levels[:, 2]], 1)
 
 
 def rotate(vector: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
     """[B, 2] rotated counter-clockwise by [B] radians."""
-    aside = vector @ constant(table, vector.device, *_QUARTER)
-    return torch.addcmul(vector * angle.cos()[:, None], aside, angle.sin()[:, None])
+    turn = (angle[:, None] + constant(torch.tensor, vector.device, _TURNED)).cos().view(-1, 2, 2)
+    return (vector[:, None] @ turn)[:, 0]
 
 
-_QUARTER = (0.0, 1.0), (-1.0, 0.0)
+_TURNED = 0.0, -math.pi / 2, math.pi / 2, 0.0  # the cosines of an angle and these are the matrix of its rotation

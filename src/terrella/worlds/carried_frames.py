@@ -4,10 +4,11 @@ and monsters, shots and doors are known from the last frames alone."""
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 
 from ..core.backend import kernels_do
 from ..space.camera import Intrinsics
-from ..space.reproject import carry_things, least_around, least_around_slowly
+from ..space.reproject import carry_things, least_around
 
 PLANES = 6  # planes that `carry_frames` adds to the last frame's colour and trust
 
@@ -26,9 +27,9 @@ class Frame(NamedTuple):
 def covered_pixels(instances: torch.Tensor, things: torch.Tensor) -> torch.Tensor:
     """The pixels bool [B, H, W] that billboards cover: those of `instances` [B, H, W], and the `things` [B, H, W] around them,
     since the pixels of their rim are mixed."""
-    bare = (instances == 0).float()
-    around = least_around if kernels_do(bare) else least_around_slowly
-    return (bare == 0) | ((around(bare) == 0) & (things > 0.5))
+    shown = (instances > 0).float()
+    around = -least_around(-shown) if kernels_do(shown) else F.max_pool2d(shown, 3, 1, 1)
+    return torch.maximum(shown, around * (things > 0.5)) > 0
 
 
 def static_depth(depth: torch.Tensor, things: torch.Tensor) -> torch.Tensor:

@@ -250,10 +250,10 @@ class Billboards(nn.Module):
         visible = (billboards[..., NUMBER] > 0) & (look != NONE)
         look = look.clamp_min(0)
         cover, colour = (
-            constant(torch.tensor, rgb.device, part) for part in ((0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0, 0.0))
+            constant(torch.tensor, rgb.device, part) for part in ((0.0, 0.0, 0.0, 1 / 255), (1 / 255,) * 3 + (0.0,))
         )
         lit = torch.addcmul(cover, billboards[..., LIGHT, None], colour)[..., None, None]
-        pictures = (self.pictures[look] / 255 * lit).clamp_max(1)
+        pictures = (self.pictures[look] * lit).clamp_max(1)
         return paint_billboards(rgb, depth, (billboards[..., PLACE], pictures, self.boxes[look]), visible, pose, camera)
 
     def bodies(self, state: State, half_m: float) -> torch.Tensor:
@@ -266,9 +266,10 @@ class Billboards(nn.Module):
         level = apart[..., 2] < STOREY_M
         outside = apart[..., :2].amax(-1) >= reach - 0.02  # a body inside of one may leave it
         stops = known & level & (reach > half_m) & outside
-        half, places = (reach - half_m)[..., None], billboards[..., PLACE][..., :2].repeat(1, 1, 2)
-        walls = torch.addcmul(places[:, None], half[:, None], constant(table, reach.device, *_SIDES)[:, None])
-        return where(stops[:, None, :, None], walls, NOWHERE).flatten(1, 2)
+        half, places = (reach - half_m)[..., None, None], billboards[..., PLACE][..., None, :2]
+        corners = constant(table, reach.device, *_SIDES).view(4, 1, 2, 2)
+        walls = torch.addcmul(places[:, None], half[:, None], corners)
+        return where(stops[:, None, :, None, None], walls, NOWHERE).view(len(walls), -1, 4)
 
     def match_evidence(self, cut: Cutout, listed: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
         """The billboards [B, K, COLUMNS] of evidence, in the rows of `listed` [B, K, 4] = number and place. Those `before`

@@ -18,7 +18,7 @@ from ..core.backend import constant, plus
 from ..core.errors import ObservationError
 from ..core.spec import DONE, REWARD
 from ..core.state import State
-from .parts import CHANGES, Channels, Evidence, Tensors, newest_frame
+from .parts import CHANGES, Channels, Ends, Evidence, Tensors, newest_frame
 
 VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -52,14 +52,15 @@ class ConstantOutcome:
         return _going(evidence)
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
+        self, before: State, after: State, ends: Ends, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
-        """Reward and end of a step that `ends` [B] or does not; no frame is read."""
+        """Reward and end of a step; no frame is read."""
+        over = ends()
         usual, last = (
-            constant(torch.tensor, ends.device, reward)
+            constant(torch.tensor, over.device, reward)
             for reward in (self.config.usual, self.config.usual + self.config.ending)
         )
-        return {"done": before["done"] | ends, "reward": torch.where(ends, last, usual)}
+        return {"done": before["done"] | over, "reward": torch.where(over, last, usual)}
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
         return {}
@@ -156,7 +157,7 @@ class FrameOutcome(nn.Module):
         return {**_going(evidence), **begun, "vitals": vitals}
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
+        self, before: State, after: State, ends: Ends, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
         """Reward, end and vitals as they are read off the frames before and after the step; where the body ends is ignored."""
         frames = newest_frame(before), newest_frame(after)

@@ -8,7 +8,7 @@ which is falsy and adds nothing to a state.
 
 # the methods of a Protocol are their docstrings
 # pyright: reportReturnType=false
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
@@ -24,6 +24,7 @@ from .generator import Conditioning, DrawnFrame
 # Streams of chance (core/chance.py); CHANGES is the first of one stream for each vital.
 NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = 1, 2, 11, 12, 13, 20
 Tensors = dict[str, torch.Tensor]  # entries of a State, [B, ...]
+Ends = Callable[[], torch.Tensor]
 
 
 @dataclass(frozen=True)
@@ -185,10 +186,10 @@ class Outcome(WorldPart, Protocol):
         """An episode that goes on, with the vitals that are observed."""
 
     def step(
-        self, before: State, after: State, ends: torch.Tensor, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
+        self, before: State, after: State, ends: Ends, action: torch.Tensor, chances: Mapping[int, torch.Tensor]
     ) -> Tensors:
-        """The outcome of the step by action [B, A]; ends [B]: whether the body says that the episode ends there; chances: random
-        numbers of `draws`. Frames are drawn only if they are read."""
+        """The outcome of the step by action [B, A]; ends(): whether the body says that the episode ends there, bool [B]; chances:
+        random numbers of `draws`. Frames are drawn only if they are read."""
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors: ...
 
