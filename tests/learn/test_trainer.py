@@ -376,6 +376,10 @@ def test_progress_says_step_and_rate(tmp_path):
     trainer_in(tmp_path, 40, report=lambda done, total, words="": lines.append((done, total, words))).train()
     assert [(done, total) for done, total, _ in lines] == [(0.5, 1.0), (1.0, 1.0)]
     assert lines[1][2].startswith("toy: step 40, ") and "steps/s, code " in lines[1][2]
+    feed = SizedFeed(lambda size: Fed(size, 8), 4)
+    run = Run.of(tmp_path / "sized", Settings(), lambda done, total, words="": lines.append((done, total, words)))
+    Trainer(run, "toy", feed, Toy(), 20).train()
+    assert "steps/s of 4, code " in lines[-1][2], "how many frames that are"
 
 
 def test_a_stage_without_a_share_ends_with_the_hours(tmp_path, monkeypatch):

@@ -211,7 +211,8 @@ class Trainer:
                 began = now - facts["seconds"] + before  # the time since the last save is taken again
                 continue
             if len(facts["recent"]) == LOG_EVERY or self.finished:
-                self._log((self.steps_done - first) / max(now - began, 1e-9))
+                since, done = timed if timed is not None and self.steps_done > timed[1] else (began, first)
+                self._log((self.steps_done - done) / max(now - since, 1e-9))
             if now - saved > run.save_every_s and self._settled():
                 self.save()
                 saved = now
@@ -409,6 +410,7 @@ class Trainer:
         facts["recent"] = []
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
         pace = f"{steps_per_s:.1f} steps/s" if steps_per_s >= 1 else f"{1 / steps_per_s:.1f} s a step"
+        pace += f" of {self.feed.size}" if isinstance(self.feed, ResizableFeed) else ""
         self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: step {self.steps_done:,}, {pace}, {words}")
 
 
