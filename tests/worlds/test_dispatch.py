@@ -47,12 +47,12 @@ def latent(pictures: bool) -> LatentWorld:
 
 
 WORLDS = {
-    "doom-maze": (lambda: terrella.load("doom-maze"), 886),
+    "doom-maze": (lambda: terrella.load("doom-maze"), 890),
     "doom-corridor": (lambda: terrella.load("doom-corridor"), 1215),
     "flow": (lambda: flow(0), 285),
     "flow that scrolls": (lambda: flow(15), 384),
     "flow that recalls": (lambda: flow(0, recalls=True), 320),
-    "islet": (lambda: terrella.load("islet"), 494),
+    "islet": (lambda: terrella.load("islet"), 492),
     "latent": (lambda: latent(True), 80),
     "arm": (lambda: latent(False), 60),
 }
