@@ -21,12 +21,12 @@ from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, cast_inverse, patch_
 from .reproject import (
     MovingFrames,
     agreement_of,
+    carried_from,
     carry_things,
     carry_unknown,
     colours_at,
     fill_holes,
     filled_inverse,
-    moved,
     places_in,
     planes_at,
     sight,
@@ -324,32 +324,46 @@ def look_slowly(
     patch = patch * valid[..., None, None]
     inverse = cast_inverse(patch.flatten(1, 2), pose, camera, size, FINE_CASTS, turn)
     hit = inverse > 0
-    # the last frame is one keyframe more, and moving frames are ones more, in views of their own, whose colours are taken apart
-    if moving is None:
+    if moving is not None:
+        looked = _see_with_moving(key_depth, viewers, turns, inverse, moving, camera)
+    else:  # the last frame is one keyframe more, whose colours are taken apart
         key_depth = key_depth if last is None else torch.cat([key_depth, last[1][:, None]], 1)
         depth = filled_inverse(inverse).reciprocal()
-        places, agreement, near = sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera)
-    else:
-        planes, splat = splat_frames(moving, turns[:, keys:-1], (pose, turn), camera)
-        filled = filled_inverse(torch.cat([inverse[:, None], splat], 1).flatten(0, 1)).unflatten(0, (batch, -1))
-        seen = torch.where(splat > 0, splat, filled[:, 1:])
-        depths = torch.cat([filled[:, :1].expand(-1, keys, -1, -1), seen], 1).reciprocal()
-        depth, seen = depths[:, 0], depths[:, keys:]
-        points = unproject(depths, pose, camera, turn)
-        places, ahead = places_in(points, viewers[:, :-1], turns[:, :-1], camera)
-        carried = planes_at(planes, places[:, keys:])
-        held = torch.cat([planes_at(key_depth[:, :, None], places[:, :keys]), carried[:, :, 4:5]], 1)[:, :, 0]
-        agreement, near = agreement_of(held, places, ahead)
+        looked = *sight(key_depth, viewers[:, :-1], turns[:, :-1], depth, (pose, turn), camera), depth, None
+    places, agreement, near, depth, carried = looked
     depths = depth[:, None], near[:, :keys]
     likeness = torch.minimum(*depths) / torch.maximum(*depths)
     colours, trust = best_slowly(colours_at(rgb, places[:, :keys]), agreement[:, :keys], likeness, valid, slots)
     glimpse = Glimpse(colours, trust, depth, (hit & (trust[:, 0] > 0)).float())
-    if moving is not None:
-        return glimpse, moved(carried, agreement[:, keys:], seen)
-    if last is None:
-        return glimpse, None
+    if last is None or moving is not None:
+        return glimpse, carried
     colour, trust = colours_at((last[0] / 255)[:, None], places[:, keys:])[:, 0], agreement[:, keys:]
     return glimpse, unknown_alone(colour, trust, glimpse.known)
+
+
+def _see_with_moving(
+    key_depth: torch.Tensor,
+    viewers: torch.Tensor,
+    turns: torch.Tensor,
+    inverse: torch.Tensor,
+    moving: MovingFrames,
+    camera: Intrinsics,
+) -> tuple[torch.Tensor, ...]:
+    """`sight` of S keyframes in the view whose 1 / depth is `inverse` [B, H, W], 0 in holes, and in the same programs of moving
+    frames, in views of their own: places [B, S, H, W, 2], agreement, depths ahead; the view's depth; and the frames as
+    `carry_things` gives them. viewers [B, S + K + 1, 7]: of keyframes, moving frames and the view; turns: their rotations."""
+    batch, keys = key_depth.shape[:2]
+    pose, turn = viewers[:, -1], turns[:, -1]
+    planes, splat = splat_frames(moving, turns[:, keys:-1], (pose, turn), camera)
+    filled = filled_inverse(torch.cat([inverse[:, None], splat], 1).flatten(0, 1)).unflatten(0, (batch, -1))
+    splat = torch.where(splat > 0, splat, filled[:, 1:])
+    depths = torch.cat([filled[:, :1].expand(-1, keys, -1, -1), splat], 1).reciprocal()
+    places, ahead = places_in(unproject(depths, pose, camera, turn), viewers[:, :-1], turns[:, :-1], camera)
+    mine = places[:, :keys].contiguous()
+    carried = planes_at(planes, places[:, keys:])
+    held = torch.cat([planes_at(key_depth[:, :, None], mine), carried[:, :, 4:5]], 1)[:, :, 0]
+    agreement, near = agreement_of(held, places, ahead)
+    return mine, agreement, near, depths[:, 0], carried_from(carried, agreement[:, keys:], depths[:, keys:])
 
 
 def best_slowly(colour, agreement, likeness, valid, slots) -> tuple[torch.Tensor, torch.Tensor]:

@@ -144,13 +144,14 @@ def cast_inverse(
     shape = shape * ((lift > 0) & (sides[:, :, 0, 0] > NEAR_M))[..., None]
     level, across, down = lines.split(EDGES, 2)
     begin = torch.addcmul(torch.addcmul(level, across, ends[..., :1]), down, ends[..., 1:2])
-    boxes = torch.cat([begin[..., :-1], shape[..., 1:], lines[..., EDGES:], shape[..., :1]], -1)
+    parts = begin[..., :-1], shape[..., 1:], lines[..., EDGES:], shape[..., :1]
+    boxes = torch.cat([part.mT for part in parts], 1)
     canvas = pose.new_zeros(batch, height * width + OUTSIDE)
     steps = [(many * max(1, round(height * width / USUAL)), tried) for many, tried in steps]
     most = max((many for many, _ in steps if many < count), default=0)
-    largest = shape.prod(-1).topk(most, dim=1).indices[..., None].expand(-1, -1, boxes.shape[2])
+    largest = shape.prod(-1).topk(most, dim=1).indices[:, None].expand(-1, boxes.shape[1], -1)
     for many, tried in steps:
-        part = boxes if many >= count else boxes.gather(1, largest[:, :many])
+        part = boxes if many >= count else boxes.gather(2, largest[..., :many])
         _cast_boxes(part, min(tried, height * width), canvas)
     return canvas[:, :-OUTSIDE].view(batch, height, width)
 
@@ -160,17 +161,18 @@ EDGES = 8
 
 
 def _cast_boxes(boxes: torch.Tensor, pixels: int, canvas: torch.Tensor) -> None:
-    """Raises `canvas` [B, H * W + OUTSIDE], 1 / depth, at the first `pixels` pixels of the boxes of patches [B, n, 3 EDGES + 1]:
+    """Raises `canvas` [B, H * W + OUTSIDE], 1 / depth, at the first `pixels` pixels of the boxes of patches [B, 3 EDGES + 1, n]:
     the EDGES functions at the first pixel, what they gain by a column and by a row, and how wide the box is."""
     number = constant(torch.arange, boxes.device, float(pixels))
-    row = torch.div(number, boxes[..., -1:], rounding_mode="floor")
-    column = torch.addcmul(number, row, boxes[..., -1:], value=-1)
-    begin, across, down = boxes[..., :-1, None].split(EDGES, 2)
-    lines = torch.addcmul(torch.addcmul(begin, across, column[:, :, None]), down, row[:, :, None])
-    hit = lines[:, :, 2:].amin(2) > 0
+    *functions, wide = boxes[..., None].split((EDGES, EDGES, EDGES, 1), 1)
+    begin, across, down = functions
+    row = torch.div(number, wide[:, 0], rounding_mode="floor")
+    column = torch.addcmul(number, row, wide[:, 0], value=-1)
+    lines = torch.addcmul(begin, across, column[:, None]).addcmul_(down, row[:, None])  # in place: the largest tensor
+    hit = lines[:, 2:].amin(1) > 0
     aside = constant(cells_outside, boxes.device, hit.shape[1] * pixels, float(canvas.shape[1])).view(hit.shape[1:])
-    pixel = torch.where(hit, lines[:, :, 0], aside).long()
-    canvas.scatter_reduce_(1, pixel.flatten(1), lines[:, :, 1].flatten(1), "amax")
+    pixel = torch.where(hit, lines[:, 0], aside).long()
+    canvas.scatter_reduce_(1, pixel.flatten(1), lines[:, 1].flatten(1), "amax")
 
 
 def _edges_of_normals(camera: Intrinsics, size: tuple[int, int]) -> torch.Tensor:

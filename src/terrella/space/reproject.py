@@ -33,16 +33,16 @@ def splat_inverse(
     size: tuple[int, int],
     turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """World points [B, N, 3] -> 1 / depth of the nearest for each pixel of the view from `pose` [B, 7], whose rotations are `turn`
-    [B, 3, 3]: [B, H, W], 0 in holes."""
-    height, width = size
-    at, depth = project(points, pose, pixel_intrinsics(camera, size), turn)
+    """World points [B, K, N, 3] -> 1 / depth of the nearest of each of K sets for each pixel of the view from `pose` [B, 7], whose
+    rotations are `turn` [B, 3, 3]: [B, K, H, W], 0 in holes."""
+    (batch, keys, count), (height, width) = points.shape[:3], size
+    at, depth = project(points.flatten(1, 2), pose, pixel_intrinsics(camera, size), turn)
     pixel, inside = pixels_at(at, size)
-    aside = constant(cells_outside, depth.device, depth.shape[1], height * width + OUTSIDE)
-    pixel = torch.where(inside & (depth > 0.05), pixel, aside)
-    canvas = depth.new_zeros(len(points), height * width + OUTSIDE)
-    canvas.scatter_reduce_(1, pixel, depth.reciprocal(), "amax")
-    return canvas[:, :-OUTSIDE].view(-1, height, width)
+    aside = constant(cells_outside, depth.device, keys * count, height * width + OUTSIDE)
+    pixel = torch.where(inside & (depth > 0.05), pixel, aside).view(-1, count)
+    canvas = depth.new_zeros(batch * keys, height * width + OUTSIDE)
+    canvas.scatter_reduce_(1, pixel, depth.reciprocal().view(-1, count), "amax")
+    return canvas[:, :-OUTSIDE].view(batch, keys, height, width)
 
 
 def least_around(plane: torch.Tensor) -> torch.Tensor:
@@ -214,7 +214,7 @@ def carry_things_slowly(rgb, depth, things, covered, pose, target_pose, camera) 
     seen = torch.where(inverse > 0, inverse, filled_inverse(inverse[:, 0])[:, None]).reciprocal()
     places, ahead = places_in(unproject(seen, target[0], camera, target[1]), frames.pose, turn, camera)
     carried = planes_at(planes, places)
-    return moved(carried, agreement_of(carried[:, :, 4], places, ahead)[0], seen)[:, 0]
+    return carried_from(carried, agreement_of(carried[:, :, 4], places, ahead)[0], seen)[:, 0]
 
 
 class MovingFrames(NamedTuple):
@@ -233,18 +233,15 @@ def splat_frames(
     """The planes [B, K, 6, H, W] of frames from which colours are taken, the fifth their depth with things made flat; and 1 / this
     depth [B, K, H, W] in the views from the pose and rotation `target`, 0 in holes. turn: the rotations of the frames."""
     rgb, depth, things, covered, pose = frames
-    keys, size = depth.shape[1], depth.shape[-2:]
     flat = _flattened(depth.flatten(0, 1), things.flatten(0, 1)).view_as(depth)
-    points = unproject(flat, pose, camera, turn).flatten(0, 1).flatten(1, 2)
-    targets = (part[:, None].expand(-1, keys, *part.shape[1:]).flatten(0, 1) for part in target)
-    place, toward = targets
-    seen = splat_inverse(points, place, camera, size, toward)
+    points = unproject(flat, pose, camera, turn).flatten(2, 3)
+    seen = splat_inverse(points, target[0], camera, depth.shape[-2:], target[1])
     seen = torch.where(seen > 0, seen, F.max_pool2d(seen, 3, 1, 1))  # closes gaps in surfaces that come nearer
     planes = torch.cat([rgb / 255, *(part[:, :, None] for part in (things, flat, covered))], 2)
-    return planes, seen.view_as(depth)
+    return planes, seen
 
 
-def moved(carried: torch.Tensor, agreement: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
+def carried_from(carried: torch.Tensor, agreement: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
     """Frames as `carry_things` gives them [B, K, 6, H, W]: from their planes in a view, their agreement with it and its depth."""
     trust = (agreement * (carried[:, :, 5] < 0.5))[:, :, None]
     carried = carried * (trust > 0)

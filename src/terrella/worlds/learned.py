@@ -229,12 +229,12 @@ class LearnedWorld:
     def advance(self, state: State, numbers: torch.Tensor, seeds: torch.Tensor) -> State:
         """The part of `imagine` that is tensors alone: by actions [B, A] of `controls.encode` and seeds int64 [B]."""
         state, after = self.move(state, numbers)
-        still, moved = state["done"], after
+        still, arrived = state["done"], after
         chances = chance.uniforms(seeds, {**self.objects.draws, **self.outcome.draws})
         after = after.replace(**self.objects.step(state, after, chances), gone=drift(state, after, led=False))
         after = self._draw(after, state, seeds, still)
         after = after.replace(
-            **self.outcome.step(state, after, lambda: self.body.ends(moved, numbers), numbers, chances)
+            **self.outcome.step(state, after, lambda: self.body.ends(arrived, numbers), numbers, chances)
         )
         others = [name for name in after if name not in (*self._drawn_names, "reward")]
         kept = _where(still, state, after, [name for name in others if after[name] is not state[name]])
