@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -21,7 +23,7 @@ def world() -> LearnedWorld:
     return found
 
 
-def heights(world: LearnedWorld, billboards: torch.Tensor) -> torch.Tensor:
+def heights(world: Any, billboards: torch.Tensor) -> torch.Tensor:
     """How tall billboards [..., COLUMNS] are, in metres; nan where there is none."""
     look = billboards[..., LOOK].long()
     return torch.where(
@@ -56,7 +58,8 @@ def test_who_is_shot_at_falls_more_often_than_who_is_not(world):
         apart = guard[PLACE] - pose[:3]
         fell = []
         for attack, beside in ((0.0, 0.0), (1.0, 0.0), (1.0, 0.38), (1.0, -0.38)):
-            looks = planar_pose(*pose[:3, None], torch.atan2(apart[1], apart[0])[None] + beside).expand(STORIES, 7)
+            looks = planar_pose(pose[:1], pose[1:2], pose[2:3], torch.atan2(apart[1], apart[0])[None] + beside)
+            looks = looks.expand(STORIES, 7)
             billboards, rng = objects.empty(STORIES), make_rng(1)
             billboards[:, 0] = guard
             acts = torch.zeros(STORIES, world.config.history, 7)

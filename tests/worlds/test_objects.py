@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from terrella.core import chance, make_rng
@@ -234,7 +236,7 @@ def test_what_was_solid_and_never_is_again_has_fallen():
 
 
 def test_a_change_that_the_actions_caused_is_a_hit_and_another_is_not():
-    objects = two_looks()
+    objects: Any = two_looks()
     objects.solid[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
     objects.follows[:] = True
     objects.think[0].weight.data.zero_()

@@ -270,9 +270,10 @@ def _carried(last: LastFrames, glimpse: Glimpse, pose: torch.Tensor, camera: Int
         return None
     if not isinstance(last, MovingFrames):
         return carry_unknown(*last, glimpse.known, glimpse.depth, pose, camera)
-    keys = last.depth.shape[:2]
-    targets = pose[:, None].expand(*keys, 7).flatten(0, 1)
-    return carry_things(*(part.flatten(0, 1) for part in last), targets, camera).unflatten(0, keys)
+    batch, keys = last.depth.shape[:2]
+    targets = pose[:, None].expand(-1, keys, -1).flatten(0, 1)
+    rgb, depth, things, covered, at = (part.flatten(0, 1) for part in last)
+    return carry_things(rgb, depth, things, covered, at, targets, camera).unflatten(0, (batch, keys))
 
 
 def _look_quickly(shared, picks, pose, camera, size, slots, own) -> Glimpse:

@@ -1,6 +1,7 @@
 """Carries posed RGB-D keyframes into another view: depth by a z-buffered forward splat, then colour by bilinear sampling backward.
 Keyframes that see another surface at a pixel are masked there."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -30,7 +31,7 @@ def splat_inverse(
     points: torch.Tensor,
     pose: torch.Tensor,
     camera: Intrinsics,
-    size: tuple[int, int],
+    size: Sequence[int],
     turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """World points [B, K, N, 3] -> 1 / depth of the nearest of each of K sets for each pixel of the view from `pose` [B, 7], whose
