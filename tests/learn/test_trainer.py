@@ -12,7 +12,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -26,6 +26,8 @@ from terrella.core.errors import TrainingError
 from terrella.learn import train_step
 from terrella.learn import trainer as module
 from terrella.learn.budget import Budget, Stage
+from terrella.learn.device_clips import DeviceClips
+from terrella.learn.feeds import ClipStream
 from terrella.learn.learners import Ema, adamw, warmup_cosine
 from terrella.learn.sized_feed import SizedFeed
 from terrella.learn.train_step import TrainStep
@@ -369,6 +371,21 @@ def test_worlds_are_seeded_by_a_generator_of_the_cpu():
     step = TrainStep(0, 0.0, given, np.random.default_rng(0), far)
     assert step.seeding is step.seeding and step.seeding.device.type == "cpu"
     assert torch.equal(chance.seeds(3, step.seeding), chance.seeds(3, make_rng(5)))
+
+
+def test_a_run_of_a_gpu_goes_on_without_one(tmp_path):
+    """What a run and its feed keep names no device; clips cut on a GPU have no order to go on in."""
+
+    @dataclass(frozen=True)
+    class OnDevice(Settings):
+        device: str = "auto"
+
+    runs = [Run.of(tmp_path, OnDevice(device=name), quiet, torch.device(name)) for name in ("cuda", "cpu")]
+    assert runs[0].recipe == runs[1].recipe
+    clips: Any = SimpleNamespace(forever=lambda: iter([{"frame": 1}]))
+    feed = ClipStream(clips, lambda batch, now: batch)
+    feed.resume(DeviceClips.state(cast(Any, None)))
+    assert feed.batch(cast(Any, None)) == {"frame": 1}
 
 
 def test_progress_says_step_and_rate(tmp_path):
