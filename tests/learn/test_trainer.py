@@ -9,7 +9,7 @@ import shutil
 import signal
 import time
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -397,6 +397,10 @@ def test_progress_says_step_and_rate(tmp_path):
     run = Run.of(tmp_path / "sized", Settings(), lambda done, total, words="": lines.append((done, total, words)))
     Trainer(run, "toy", feed, Toy(), 20).train()
     assert "steps/s of 4, code " in lines[-1][2], "how many frames that are"
+    busy = Trainer(replace(run, out=tmp_path / "busy"), "toy", feed, Toy(), 20)
+    busy._busy_percent = lambda: 87  # as on a GPU
+    busy.train()
+    assert "steps/s of 4, GPU 87% busy, code " in lines[-1][2]
 
 
 def test_a_stage_without_a_share_ends_with_the_hours(tmp_path, monkeypatch):

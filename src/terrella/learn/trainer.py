@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from ..core import nvml
 from ..core.errors import TrainingError, is_out_of_memory, reason_of
 from ..core.precision import half_is_native
 from ..core.world import make_rng
@@ -146,6 +147,7 @@ class Trainer:
         saved = run.saved_facts(stage)
         for module in objective.modules.values():
             module.to(self.device)
+        self._busy_percent = nvml.busy_percent() if self.device.type == "cuda" else None
         self._halved: list[bool] = []
         self._finite: list[torch.Tensor] = []  # of the steps since losses were last read
         self._updates: dict[str, Update] = {}  # of each learner
@@ -411,6 +413,7 @@ class Trainer:
         words = " ".join(f"{name} {value:.4f}" for name, value in mean.items())
         pace = f"{steps_per_s:.1f} steps/s" if steps_per_s >= 1 else f"{1 / steps_per_s:.1f} s a step"
         pace += f" of {self.feed.size}" if isinstance(self.feed, ResizableFeed) else ""
+        pace += f", GPU {self._busy_percent()}% busy" if self._busy_percent else ""
         self.run.report(min(self.share, 1.0), 1.0, f"{self.stage}: step {self.steps_done:,}, {pace}, {words}")
 
 

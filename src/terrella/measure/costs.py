@@ -1,12 +1,12 @@
 """Costs of a world: milliseconds, joules and bytes, per interactive frame and per imagined second."""
 
-import ctypes
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 
+from ..core import nvml
 from ..core.policy import Policy
 from ..core.spec import kind_of
 from ..core.state import State, memory_of
@@ -14,7 +14,6 @@ from ..core.world import World
 from .rollouts import Results, Tick
 
 POWERCAP = Path("/sys/class/powercap")
-NVML = "libnvidia-ml.so.1"
 WATTS_OF_A_CORE = 10.0  # assumed without an energy counter
 WARM = 10  # steps before the first that is timed
 SAMPLES = 20  # of the memory of a rollout
@@ -27,7 +26,7 @@ class EnergyMeter:
     def __init__(self, cuda: bool = False) -> None:
         self.files = sorted(file for file in POWERCAP.glob("*-rapl:?/energy_uj") if _of_a_processor(file))
         locked = not self.files and any(POWERCAP.glob("*-rapl:?/energy_uj"))
-        self._gpu_mj = _gpu_counter() if cuda else None
+        self._gpu_mj = nvml.energy_mj() if cuda else None
         self._first, self._busy = self._readings(), time.process_time()
         self._first_mj = self._gpu_mj() if self._gpu_mj else 0
         self.estimated = not self.files
@@ -110,23 +109,3 @@ def _of_a_processor(file: Path) -> bool:
         return all(files.values()) and files["name"].startswith("package")
     except OSError:
         return False
-
-
-def _gpu_counter() -> Callable[[], int] | None:
-    """Reads the millijoules of the first GPU since its driver was loaded (nvmlDeviceGetTotalEnergyConsumption);
-    None without NVML."""
-    value = ctypes.c_ulonglong()
-    try:
-        nvml, device = ctypes.CDLL(NVML), ctypes.c_void_p()
-        if nvml.nvmlInit_v2() or nvml.nvmlDeviceGetHandleByIndex_v2(0, ctypes.byref(device)):
-            return None
-        if nvml.nvmlDeviceGetTotalEnergyConsumption(device, ctypes.byref(value)):
-            return None
-    except (OSError, AttributeError):
-        return None
-
-    def read() -> int:
-        nvml.nvmlDeviceGetTotalEnergyConsumption(device, ctypes.byref(value))
-        return value.value
-
-    return read
