@@ -196,14 +196,28 @@ def test_a_goal_that_the_skills_do_not_see_is_named():
         ObservedGoal.of("eye=1", {"eye": torch.ones(1, 1)}, spec, 0.05, library_of())
 
 
+def test_codes_of_cells_differ_or_not():
+    """They are no shades: a wall (2) is not nearly an empty cell (1)."""
+    ends = {"image": torch.ones(2, 7, 7, 3, dtype=torch.uint8)}
+    ends["image"][1, 3, 6, 0] = 2
+    library = replace(library_of(), ends=ends, end_texts=("go to the red key", "go to the blue key"))
+    spec = Spec("made", spaces.Discrete(2), {"image": spaces.Box(0, 255, (7, 7, 3), np.uint8)}, (), 0.1)
+    cells = torch.full((1, 7, 7, 3), torch.nan)
+    cells[0, 3, 6, 0] = 2
+    goal = ObservedGoal.of("image=cells.json", {"image": cells}, spec, 0.05, library)
+    assert goal.distance(ends).tolist() == pytest.approx([1, 0], abs=1e-5) and goal.instructions(library) == (
+        "go to the blue key",
+    )
+
+
 def test_a_picture_as_a_goal_is_compared_in_the_size_of_the_ends():
-    ends = {"rgb": torch.zeros(2, 4, 4, 3, dtype=torch.uint8)}
+    ends = {"rgb": torch.zeros(2, 16, 16, 3, dtype=torch.uint8)}
     ends["rgb"][1] = 204
     library = replace(library_of(), ends=ends, end_texts=("go to the red key", "go to the blue key"))
-    spec = Spec("made", spaces.Discrete(2), {"rgb": spaces.Box(0, 255, (8, 8, 3), np.uint8)}, (), 0.1)
-    goal = ObservedGoal.of("a.png", {"rgb": torch.full((1, 8, 8, 3), 255, dtype=torch.uint8)}, spec, 0.3, library)
+    spec = Spec("made", spaces.Discrete(2), {"rgb": spaces.Box(0, 255, (32, 32, 3), np.uint8)}, (), 0.1)
+    goal = ObservedGoal.of("a.png", {"rgb": torch.full((1, 32, 32, 3), 255, dtype=torch.uint8)}, spec, 0.3, library)
     assert goal.instructions(library) == ("go to the blue key",)
-    assert goal.distance({"rgb": torch.full((1, 8, 8, 3), 255)}).item() < 0.01
+    assert goal.distance({"rgb": torch.full((1, 32, 32, 3), 255)}).item() < 0.01
 
 
 def test_a_name_stands_for_a_goal_of_others(tmp_path):

@@ -12,13 +12,12 @@ import torch.nn.functional as F
 from torch import nn
 
 from ..core.errors import ChannelError
-from ..core.spec import BUTTONS, CHOICE, Spec, shape_of
+from ..core.spec import BUTTONS, CHOICE, Spec, is_picture, shape_of
 from .actor_network import AXES, MAX_SYMLOG, ActorConfig, mlp, symlog
 from .embodiment import EMBODIMENT, Embodiment, index_of
 from .sentences import WordEncoder
 
 TEXT = "text"
-LEAST_PICTURE_SIDE = 16  # pixels: smaller arrays [H, W, C] are codes of cells, as those of MiniGrid
 CODES = 32  # values of a code
 CELLS = 4  # side of the pooled feature map of a picture
 QUERIES = 4  # places of a picture to which an instruction attends, for each of its waypoints
@@ -97,10 +96,6 @@ class ImitationConfig:
             return actor.actions(torch.atanh(encoded.clamp(-1 + 1e-6, 1 - 1e-6)), spec)
         parts = encoded.split(list(self.actor.counts), 1)
         return self.actor.actions(torch.stack([part.argmax(1) for part in parts], 1).float(), spec)
-
-
-def is_picture(shape: tuple[int, ...]) -> bool:
-    return len(shape) == 3 and min(shape[:2]) >= LEAST_PICTURE_SIDE
 
 
 class _Look(nn.Module):

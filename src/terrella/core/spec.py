@@ -26,6 +26,7 @@ TEXT = spaces.Box(0, 255, (TEXT_BYTES,), np.uint8)
 INSTRUCTION = spaces.Box(-1, 1, (INSTRUCTION_SIZE,), np.float32)
 POSE_UNIT = "m, quaternion wxyz of T_world_cam"
 PLACES_UNIT = "x and y in m, heading in rad, kind"
+LEAST_PICTURE_SIDE = 16  # pixels
 WALKABLE = 4  # kind in the channel `places`: somewhere to stand (core/world.py)
 NO_MOUNT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
@@ -53,6 +54,11 @@ def torch_dtype_of(space: spaces.Space) -> torch.dtype:
     import torch
 
     return torch.from_numpy(np.zeros(0, space.dtype)).dtype
+
+
+def is_picture(shape: tuple[int, ...]) -> bool:
+    """Whether arrays [H, W, C] are pictures; smaller ones are codes of cells, as those of MiniGrid."""
+    return len(shape) == 3 and min(shape[:2]) >= LEAST_PICTURE_SIDE
 
 
 def kind_of(channel: str) -> str:

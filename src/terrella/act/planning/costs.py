@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 from ...core.errors import ObservationError, PlanningError
-from ...core.spec import Spec, kind_of
+from ...core.spec import Spec, dtype_of, is_picture, kind_of, shape_of
 from ...core.world import Observation, World, make_rng
 
 LATENT = "latent"  # the channel in which a world compares pictures, if it has one
@@ -72,8 +72,8 @@ def distance_to(
 
 def distance(spec: Spec, goal: Observation, seen: Observation) -> torch.Tensor:
     """The mean over the channels of `goal` [B or 1, ...] of the RMS difference to `seen`, [B, N, ...] or [B, ...]: float [B, N]
-    or [B]. Pictures are in shares of full brightness, bounded numbers in shares of their range, others as they are. NaN in a
-    goal counts as met. Of the two quaternions of a rotation, the nearer counts."""
+    or [B]. Pictures are in shares of full brightness, bounded numbers in shares of their range, others as they are; codes of cells
+    differ by 1 or not at all. NaN in a goal counts as met. Of the two quaternions of a rotation, the nearer counts."""
     total = []
     for name, wanted in goal.items():
         now = seen[name].float()
@@ -82,11 +82,16 @@ def distance(spec: Spec, goal: Observation, seen: Observation) -> torch.Tensor:
         if kind_of(name) == "pose":
             flipped = (now * wanted)[..., 3:].nansum(-1, keepdim=True) < 0
             now = torch.cat([now[..., :3], torch.where(flipped, -now[..., 3:], now[..., 3:])], -1)
-        mask = ~torch.isnan(wanted)
-        error = torch.where(mask, (now - wanted) / scale_of(spec.channels[name]).to(now.device), 0.0)
-        error, mask = (each[..., None].flatten(lead) for each in (error, mask))
+        mask, space = ~torch.isnan(wanted), spec.channels[name]
+        away = (now != wanted).float() if _holds_codes(name, space) else (now - wanted) / scale_of(space).to(now.device)
+        error, mask = (each[..., None].flatten(lead) for each in (torch.where(mask, away, 0.0), mask))
         total.append((error.square().sum(-1) / mask.sum(-1).clamp_min(1) + _TINY).sqrt())
     return torch.stack(total).mean(0)
+
+
+def _holds_codes(name: str, space: spaces.Space) -> bool:
+    shape, bytes_alone = shape_of(space), np.issubdtype(dtype_of(space), np.integer)
+    return kind_of(name) != "rgb" and len(shape) == 3 and not is_picture(shape) and bytes_alone
 
 
 def scale_of(space: spaces.Space) -> torch.Tensor:

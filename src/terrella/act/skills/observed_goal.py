@@ -50,9 +50,8 @@ class ObservedGoal:
 
     def distance(self, seen: Observation) -> torch.Tensor:
         """Of observations [N, ...]: [N]."""
-        return distance(
-            self.spec, self.value, {name: _resized(seen[name], one) for name, one in self.value.items()}
-        ).cpu()
+        sized = {name: _resized(seen[name], one) for name, one in self.value.items()}
+        return distance(self.spec, self.value, sized).cpu()
 
     def instructions(self, library: SkillLibrary) -> tuple[str, ...]:
         """Those that end within the distance nearly as often as the one that does most often. PlanningError if none does."""

@@ -15,11 +15,11 @@ from ...act.actor import RUN_SUBFOLDER
 from ...act.actor_network import ActorConfig
 from ...act.embodiment import Embodiment
 from ...act.imitation import ImitationActor
-from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork, is_picture
+from ...act.imitation_network import AXES, ImitationConfig, ImitationNetwork
 from ...act.sentences import vocabulary_of
 from ...core.errors import DatasetError, TrainingError
 from ...core.similar import did_you_mean
-from ...core.spec import CHOICE, Spec, kind_of
+from ...core.spec import CHOICE, Spec, is_picture, kind_of
 from ...data import Dataset
 from ...data.channels import ESTIMATES, PRIVILEGED, usually_seen
 from ...data.training.cache import array_for
