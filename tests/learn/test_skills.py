@@ -28,6 +28,7 @@ from terrella.learn.recipes.imitation import Imitation, open_demonstrations, tra
 from terrella.learn.recipes.skills import Segments, SkillRows, _skill, lasting
 from terrella.sim.gymnasium import GymnasiumWorld
 from terrella.workflows.page_agents import PageAgents
+from terrella.workflows.skills import SkillEpisode, SkillPlanResult
 
 NAME = "gym:tests.learn.test_skills:TerrellaErrands-v0"
 BOTH = "gym:tests.learn.test_skills:TerrellaBoth-v0"
@@ -265,8 +266,13 @@ def test_an_observation_is_a_goal_of_skills(library, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     world = GymnasiumWorld(Errands)
     blue = [bool(world.render(world.start(1, make_rng(n)), ("grid",))["grid"][0, 0, 6, 0] == 5) for n in range(8)]
-    print(blue, result)
     assert [one["finished"] for one in result["episodes"]] == blue and 0 < sum(blue) < 8
+
+
+def test_episodes_that_begin_at_the_goal_are_counted():
+    here, there = SkillEpisode(("reached",), True, 0.0, 0), SkillEpisode(("a", "b"), True, 0.0, 9)
+    said = SkillPlanResult("grid=1", (here, there), within=0.05).summary()
+    assert said.startswith("The goal, grid=1 within 0.05, was reached in 1 [") and "1 of 2 began at it." in said
 
 
 def test_a_library_is_not_written_over_something_else(library, capsys):

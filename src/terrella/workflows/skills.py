@@ -146,6 +146,8 @@ class SkillPlanResult:
         lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
         if self.within is not None:
             lines = [f"The goal, {self.goal} within {self.within:g}, was reached in {self.finished} of the episodes."]
+            if solved := sum(one.finished and not one.steps for one in self.episodes):
+                lines.append(f"{solved} of {len(self.episodes)} began at it.")
         if not self.goal:
             mean = sum(one.reward for one in self.episodes) / len(self.episodes)
             lines.append(f"By the environment's own rules {self.rewarded} succeeded; their mean return is {mean:.2f}.")
