@@ -24,7 +24,7 @@ from .generator import Conditioning, DrawnFrame
 # Streams of chance (core/chance.py); CHANGES is the first of one stream for each vital.
 NOISE, STARTS, LOOKS, MOVES, GOES, CHANGES = 1, 2, 11, 12, 13, 20
 Tensors = dict[str, torch.Tensor]  # entries of a State, [B, ...]
-Ends = Callable[[], torch.Tensor]
+Ends = Callable[[], torch.Tensor]  # whether the body says that an episode ends, bool [B]
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,11 @@ class Generator(WorldPart, Protocol):
 
 @runtime_checkable
 class Objects(WorldPart, Protocol):
-    """Things that move by themselves. draws: the shapes of the random numbers of a step, by their streams."""
+    """Things that move by themselves."""
 
-    draws: Mapping[int, Sequence[int]]
+    @property
+    def draws(self) -> Mapping[int, Sequence[int]]:
+        """The shapes of the random numbers of a step, by their streams."""
 
     def channels(self, size: tuple[int, int]) -> Channels: ...
     def start(self, pick: torch.Tensor, state: State) -> Tensors:
@@ -175,11 +177,13 @@ class Objects(WorldPart, Protocol):
 
 @runtime_checkable
 class Outcome(WorldPart, Protocol):
-    """What a step brings beside its frame: reward float32 [B], done bool [B], vitals. begins: vitals of a new episode; draws: as of
-    Objects."""
+    """What a step brings beside its frame: reward float32 [B], done bool [B], vitals. begins: vitals of a new episode."""
 
     begins: tuple[float, ...]
-    draws: Mapping[int, Sequence[int]]
+
+    @property
+    def draws(self) -> Mapping[int, Sequence[int]]:
+        """The shapes of the random numbers of a step, by their streams."""
 
     def channels(self) -> Channels: ...
     def observe(self, prior: State | None, evidence: Evidence, observation: Mapping[str, torch.Tensor]) -> Tensors:
