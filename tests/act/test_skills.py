@@ -19,6 +19,7 @@ from terrella.act.skills.predictor import SkillOutlook, SkillPredictor
 from terrella.act.skills.search import SkillSearch, undone
 from terrella.core.errors import CheckpointError, PlanningError
 from terrella.core.spec import Spec
+from terrella.workflows.goals import is_observation
 
 TEXTS = [
     f"{verb} {colour} {kind}"
@@ -194,6 +195,30 @@ def test_a_goal_that_the_skills_do_not_see_is_named():
         PlanningError, match="the skills do not see 'eye'; they see hand. Give a goal of these, or in words."
     ):
         ObservedGoal.of("eye=1", {"eye": torch.ones(1, 1)}, spec, 0.05, library_of())
+
+
+def test_a_goal_that_leaves_all_open_is_refused_and_arrays_that_are_no_pictures_keep_their_range():
+    library = library_of()
+    spec = Spec("made", spaces.Discrete(2), {"hand": spaces.Box(0, 2, (1,), np.float32)}, (), 0.1)
+    with pytest.raises(PlanningError, match="hand=_ leaves every number open; give one or more"):
+        ObservedGoal.of("hand=_", {"hand": torch.full((1, 1), torch.nan)}, spec, 0.05, library)
+    shares = {"share": torch.zeros(2, 32, 32, 3)}
+    spec = Spec("made", spaces.Discrete(2), {"share": spaces.Box(0, 1, (32, 32, 3), np.float32)}, (), 0.1)
+    library = replace(library, ends=shares, end_texts=("go to the red key", "go to the blue key"))
+    goal = ObservedGoal.of("share=a.npy", {"share": torch.ones(1, 32, 32, 3)}, spec, 0.05, library)
+    assert goal.distance(shares).tolist() == pytest.approx([1, 1])
+    with pytest.raises(PlanningError, match="comes nearest, 1 away; give another goal.$"):
+        goal.instructions(library)
+
+
+@pytest.mark.parametrize("text", ["a.png", "0.5,_", "0.1,1e-3", "nan,0", "cells.npy", "cells.json", "hand=1", "-1"])
+def test_what_is_no_sentence_is_an_observation(text):
+    assert is_observation(text)
+
+
+@pytest.mark.parametrize("text", ["", "?", "go to the red ball", "go to the ball = red", "reward"])
+def test_all_else_is_a_sentence(text):
+    assert not is_observation(text)
 
 
 def test_codes_of_cells_differ_or_not():

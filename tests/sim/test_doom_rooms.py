@@ -88,14 +88,19 @@ def test_the_way_leads_around_walls(world):
 
 
 def test_wordings_that_training_never_sees_and_no_task_at_all():
-    for variant, check in (("rooms:unseen", HELD_OUT), ("rooms:free", ("{}",))):
-        world = terrella.load(f"doom:my_way_home:{variant}")
-        state = world.start(1, make_rng(0))
-        text = text_of(world, state)
-        assert text in [one.format(name) for one in check for name in (*world.rooms, "")]
-        if not text:
-            assert world.spec.max_episode_steps is None and not world.render(state, ("expert",))["expert"].any()
-        world.close()
+    world = terrella.load("doom:my_way_home:rooms:unseen")
+    assert text_of(world, world.start(1, make_rng(0))) in [one.format(name) for one in HELD_OUT for name in world.rooms]
+    world.close()
+    world = terrella.load("doom:my_way_home:rooms:free")
+    state = world.start(1, make_rng(0))
+    assert text_of(world, state) == "" and world.spec.max_episode_steps is None
+    assert not world.render(state, ("expert",))["expert"].any()
+    world.close()
+
+
+def test_a_skill_at_which_the_player_cannot_be_placed_is_refused():
+    with pytest.raises(TerrellaError, match="skill 5: the game does not let its player be placed; give 1 to 4"):
+        terrella.load("doom:my_way_home:rooms", skill=5)
 
 
 @pytest.mark.parametrize(

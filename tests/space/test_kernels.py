@@ -127,10 +127,13 @@ def test_keyframes_are_taken_by_a_list_as_by_a_mask():
     assert patches(keys.depth, keys.pose, CAMERA, 8).shape == keys.coarse.shape
 
 
-def test_things_are_carried_as_the_slow_twin_does():
+@pytest.mark.parametrize("beyond_m", [0.0, 100.0, 250.0])
+def test_things_are_carried_as_the_slow_twin_does(beyond_m):
+    """Also where a part of the picture is beyond all that is known."""
     rng = make_rng(7)
     rgb = torch.randint(0, 256, (3, 3, 24, 32), generator=rng, dtype=torch.uint8)
     depth, things = 2 + torch.rand(3, 24, 32, generator=rng) * 0.1, (torch.rand(3, 24, 32, generator=rng) < 0.3).float()
+    depth[:, :, 20:] += beyond_m
     given = (
         rgb,
         depth,

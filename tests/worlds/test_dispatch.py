@@ -48,7 +48,7 @@ def latent(pictures: bool) -> LatentWorld:
 
 WORLDS = {
     "doom-maze": (lambda: terrella.load("doom-maze"), 885),
-    "doom-corridor": (lambda: terrella.load("doom-corridor"), 1206),
+    "doom-corridor": (lambda: terrella.load("doom-corridor"), 1207),
     "flow": (lambda: flow(0), 285),
     "flow that scrolls": (lambda: flow(15), 384),
     "flow that recalls": (lambda: flow(0, recalls=True), 320),

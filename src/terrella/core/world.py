@@ -35,7 +35,8 @@ class World(Protocol):
         picture = world.render(state, ("rgb",))["rgb"]
 
     States are values: no verb changes its arguments. The caller decides on gradients and inference mode; no verb forces
-    either. Randomness comes from `rng` alone, and a batch of B gives the same as B single episodes stepped in turn.
+    either. Randomness comes from `rng` alone, and a batch of B gives the same as B single episodes stepped in turn,
+    up to rounding (of learned pictures in batches of more than 16: half precision, where a CPU has it).
     """
 
     spec: Spec

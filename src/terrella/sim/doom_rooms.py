@@ -36,14 +36,16 @@ class _Episode:
 
 class DoomRooms:
     """Doom's map with a room to go to. An episode starts in another named room, anywhere, in any direction. `text` names the room;
-    `expert` is the action of a teacher who knows the map; reward 1 and the end of the episode when the player is in the room. A
-    step is 4 tics. variant: "rooms"; "rooms:unseen" has wordings that training never sees; "rooms:free" asks for nothing and goes
-    on. TerrellaError for a map without rooms of known walls."""
+    `expert` is the action of a teacher who knows the map; reward 1 and the end of the episode when the player is in the room. The
+    map's own goal, an armour, ends an episode without success. A step is 4 tics. variant: "rooms"; "rooms:unseen" has wordings that
+    training never sees; "rooms:free" asks for nothing and goes on. TerrellaError for a map without rooms of known walls."""
 
     def __init__(self, config: DoomConfig, variant: str = "rooms"):
         if variant not in VARIANTS:
             hint = did_you_mean(variant, VARIANTS) or "."
             raise TerrellaError(f"there is no task '{variant}'{hint} Doom has {', '.join(VARIANTS)}.")
+        if (config.skill or SKILL) > SKILL:
+            raise TerrellaError(f"skill {config.skill}: the game does not let its player be placed; give 1 to {SKILL}.")
         self._doom = inner = Doom(replace(config, tics=TICS, skill=config.skill or SKILL))
         self._variant, self._wordings = variant, HELD_OUT if variant == "rooms:unseen" else WORDINGS
         self._walls, textures = inner.walls(), wall_textures(Path(inner.wad), inner.map_name)

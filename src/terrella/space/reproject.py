@@ -26,6 +26,8 @@ from .kernels_numba.carried import carry, fetch, splat
 from .kernels_numba.planes import fill
 from .views import arrays, each_view
 
+BEFORE_FAR_M = FAR_M * (1 - 1e-6)  # depths from FAR_M on are holes
+
 
 def splat_inverse(
     points: torch.Tensor,
@@ -40,7 +42,7 @@ def splat_inverse(
     at, depth = project(points.flatten(1, 2), pose, pixel_intrinsics(camera, size), turn)
     pixel, inside = pixels_at(at, size)
     aside = constant(cells_outside, depth.device, keys * count, height * width + OUTSIDE)
-    pixel = torch.where(inside & (depth > 0.05), pixel, aside).view(-1, count)
+    pixel = torch.where(inside & (depth.clamp(0.05, BEFORE_FAR_M) == depth), pixel, aside).view(-1, count)
     canvas = depth.new_zeros(batch * keys, height * width + OUTSIDE)
     canvas.scatter_reduce_(1, pixel, depth.reciprocal().view(-1, count), "amax")
     return canvas[:, :-OUTSIDE].view(batch, keys, height, width)

@@ -37,7 +37,19 @@ def read_goal(text: str, spec: Spec) -> dict[str, torch.Tensor]:
 
 def is_observation(text: str) -> bool:
     """Whether a goal of skills is a picture, CHANNEL=VALUE or numbers, not words."""
-    return "=" in text or text.lower().endswith(PICTURES) or not any(letter.isalpha() for letter in text)
+    name, equals, _ = text.partition("=")
+    if (equals and len(name.split()) == 1) or text.lower().endswith((*PICTURES, ".npy", ".json")):
+        return True
+    words = [word.strip() for word in text.strip("[]() ").split(",")]
+    return all(word in _WILDCARDS or _is_number(word) for word in words)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+        return True
+    except ValueError:
+        return False
 
 
 def with_estimated_pose(goal: Observation, world: World) -> Observation:

@@ -63,11 +63,11 @@ class EnvironmentConfig:
         from ..sim import randomised
 
         if self.task is not None:
-            if not name.startswith(("mujoco:", "doom:")):
+            if not name.startswith(("mujoco:", "doom:")) and name != "doom":
                 raise TerrellaError(
                     "--task is for the robots of MuJoCo and for maps of Doom; other worlds have one task."
                 )
-            name = f"{name}:{self.task}"
+            name = f"{'doom:my_way_home' if name == 'doom' else name}:{self.task}"
         if self.fps is not None and not 0 < self.fps < 10_000:
             raise TerrellaError(
                 f"--fps {self.fps:g} is no number of steps per second; give the rate at which a person plays, as in --fps 15."

@@ -130,6 +130,10 @@ class SkillPlanResult:
     within: float | None = None  # the distance at which a goal is reached that is no sentence
 
     @property
+    def began_at_goal(self) -> int:
+        return sum(one.finished and not one.steps for one in self.episodes)
+
+    @property
     def finished(self) -> Figure:
         return wilson(sum(one.finished for one in self.episodes), len(self.episodes))
 
@@ -140,14 +144,15 @@ class SkillPlanResult:
 
     def to_json(self) -> dict[str, Any]:
         shares = {"finished": asdict(self.finished), "rewarded": asdict(self.rewarded)}
-        return jsonable({"goal": self.goal, **shares, "episodes": [asdict(one) for one in self.episodes]})
+        facts = {"goal": self.goal, "within": self.within, "began_at_goal": self.began_at_goal}
+        return jsonable({**facts, **shares, "episodes": [asdict(one) for one in self.episodes]})
 
     def summary(self) -> str:
         lines = [f"All steps were done in {self.finished} of the episodes, by the library's own judgement."]
         if self.within is not None:
             lines = [f"The goal, {self.goal} within {self.within:g}, was reached in {self.finished} of the episodes."]
-            if solved := sum(one.finished and not one.steps for one in self.episodes):
-                lines.append(f"{solved} of {len(self.episodes)} began at it.")
+            if self.began_at_goal:
+                lines.append(f"{self.began_at_goal} of {len(self.episodes)} began at it.")
         if not self.goal:
             mean = sum(one.reward for one in self.episodes) / len(self.episodes)
             lines.append(f"By the environment's own rules {self.rewarded} succeeded; their mean return is {mean:.2f}.")

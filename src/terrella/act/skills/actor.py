@@ -103,13 +103,13 @@ class SkillActor:
             return one
         away, over = float(self.goal.distance(seen)[0]), len(one.plan.steps)
         if away <= self.goal.within:
-            return one if one.finished else replace(one, at=over, events=(*one.events, f"reached: {away:.3g} away"))
+            return one if one.finished else replace(one, at=over, events=(*one.events, f"reached, {away:.2f} away"))
         if not one.finished:
             return one
-        if one.plans == MOST_PLANS:
-            return replace(one, at=over - 1)
+        if one.plans == MOST_PLANS:  # the last skill goes on
+            return replace(one, at=over - 1, events=one.events[:-1])
         again = replace(one, groups=self._groups(one.goal, seen), plan=None)
-        return self._begun(again, seen, f"still {away:.3g} away")
+        return self._begun(again, seen, f"still {away:.2f} away")
 
     def _groups(self, goal: str, seen: Observation) -> Groups:
         return (
