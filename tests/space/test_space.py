@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrella.space.camera import planar_pose, project, unproject, yaw
+from terrella.space.camera import FAR_M, planar_pose, project, unproject, yaw
 from terrella.space.floorplan import NOWHERE, floor_plan, slide, wall_segments
 from terrella.space.keyframes import (
     Keyframes,
@@ -21,7 +21,7 @@ from terrella.space.keyframes import (
     retrieve,
     retrieve_slowly,
 )
-from terrella.space.patches import FAR_M, patches, patches_slowly
+from terrella.space.patches import patches, patches_slowly
 from terrella.space.reproject import carry_unknown_slowly, fill_holes, warp
 
 from .rooms import CAMERA, SIZE, cast, cast_slowly, painted, pose_at, room_depth

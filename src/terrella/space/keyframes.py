@@ -17,7 +17,7 @@ from .camera import FAR_M, NEAR_M, SAME, Intrinsics, pixel_intrinsics, pixels_at
 from .floorplan import WALLS, wall_segments
 from .kernels_numba import recall as kernels
 from .kernels_numba.surfaces import surfaces
-from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast, cast_inverse, patch_count, patches, patches_slowly
+from .patches import COARSE_CASTS, FINE_CASTS, SLANT, cast_inverse, patch_count, patches, patches_slowly
 from .reproject import (
     MovingFrames,
     agreement_of,
@@ -171,7 +171,7 @@ def retrieve_slowly(shared, pose, camera, size, count, own, rows) -> torch.Tenso
     thinned = camera[0] / scale[0], camera[1] / scale[1], *middle
     coarse = torch.cat([shared.coarse.flatten(0, 1).expand(batch, -1, -1), own.coarse[rows].flatten(1, 2)], 1)
     turn = rotation(pose)
-    depths = cast(coarse, pose, thinned, grid, COARSE_CASTS, turn)
+    depths = cast_inverse(coarse, pose, thinned, grid, COARSE_CASTS, turn).reciprocal().clamp_max(FAR_M)
     points, depths = unproject(depths, pose, thinned, turn).flatten(1, 2), depths.flatten(1)
     votes = vote_slowly(shared, own, rows, points, depths, camera)
     if not votes.shape[1]:

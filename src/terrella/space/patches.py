@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 
 from ..core.backend import constant, kernels_do, table, where
-from .camera import FAR_M, NEAR_M, OUTSIDE, Intrinsics, cells_outside, rotation, unproject
+from .camera import NEAR_M, OUTSIDE, Intrinsics, cells_outside, rotation, unproject
 from .kernels_numba.surfaces import lift
 from .views import arrays, each_view
 
@@ -99,19 +99,6 @@ def _around(height: int, width: int, stride: int) -> torch.Tensor:
     return rows.clamp(0, height - 1) * width + columns.clamp(0, width - 1)
 
 
-def cast(
-    patch: torch.Tensor,
-    pose: torch.Tensor,
-    camera: Intrinsics,
-    size: tuple[int, int],
-    steps=FINE_CASTS,
-    turn: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], whose rotations are `turn` [B, 3, 3], FAR_M where there is none: in
-    plain tensor algebra, for all devices."""
-    return cast_inverse(patch, pose, camera, size, steps, turn).reciprocal().clamp_max(FAR_M)
-
-
 def cast_inverse(
     patch: torch.Tensor,
     pose: torch.Tensor,
@@ -120,7 +107,8 @@ def cast_inverse(
     steps=FINE_CASTS,
     turn: torch.Tensor | None = None,
 ) -> torch.Tensor:
-    """1 / depth as `cast` gives it, 0 where there is none.
+    """1 / depth [B, H, W] of `patch` [B, N, 9] from `pose` [B, 7], whose rotations are `turn` [B, 3, 3], 0 where there is none: in
+    plain tensor algebra, for all devices.
 
     Patches are tried at the first pixels of the boxes around their pictures, in `steps` of fixed sizes, so that no shape depends on
     a value: few pixels of all, more of the largest, all of the very largest. What does not fit is left out."""

@@ -17,11 +17,10 @@ from ..core.backend import kernels_do
 from ..core.errors import ObservationError
 from ..core.spec import PLACES_UNIT
 from ..core.state import State
-from ..space.camera import Intrinsics, turn_between
+from ..space.camera import FAR_M, Intrinsics, turn_between
 from ..space.floorplan import floor_plan
 from ..space.keyframes import Keyframes
 from ..space.memory import RECORDED, Memory, keyframe_table
-from ..space.patches import FAR_M
 from ..space.recognise import thumbnails
 from ..space.reproject import MovingFrames, fill_holes
 from .carried_frames import covered_pixels, static_depth

@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from ..core import chance
-from ..core.backend import constant, kernels_do
+from ..core.backend import constant, derived, kernels_do
 from ..core.deferred import Deferred, Step
 from ..core.errors import ContractError
 from ..core.spec import Camera, Spec
@@ -259,7 +259,7 @@ class LearnedWorld:
             return state, state.replace(**after, pose=pose)
         state, walls = self.scene.walls(state)
         walls = self.objects.add_walls(walls, state, self.body.half_m)
-        after |= self.body.step(state, acts, walls, self.scene.recorded.pose[:, :3])
+        after |= self.body.step(state, acts, walls, derived(_places, self.scene.recorded.pose))
         return state, state.replace(**after)
 
     def look(self, after: State, before: State) -> Conditioning:
@@ -326,6 +326,11 @@ class LearnedWorld:
         conditioning = self.look(state, state)
         expected = self.uncertainty.expected(conditioning, self._generated(conditioning, seeds), state["gone"])
         return state.replace(**expected._asdict())
+
+
+def _places(pose: torch.Tensor) -> torch.Tensor:
+    """Of poses [K, 7]: [K, 3]. Made once, so that what is derived of it is, too."""
+    return pose[:, :3].contiguous()
 
 
 def _finished(part: Any) -> Any:

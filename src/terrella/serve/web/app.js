@@ -194,7 +194,10 @@ function able(button, why, title) {
 }
 
 /** How a number is called: events are counted. */
-function label(name) { return name.replaceAll('_', ' ') + (worlds[0].events.includes(name) && !/(n|d)$/.test(name) ? 's' : ''); }
+function label(name) {
+  const counted = worlds[0].events.includes(name) && !/(n|d)$/.test(name);
+  return name.replaceAll('_', ' ') + (!counted ? '' : /s$/.test(name) ? 'es' : 's');
+}
 
 /** What a number means; '' where its name says it. */
 function explained(name) {
