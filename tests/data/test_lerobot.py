@@ -8,6 +8,7 @@ TERRELLA_LEROBOT_PYTHON; without it these tests are skipped.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -58,7 +59,6 @@ except RuntimeError:
     library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
     library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-root = sys.argv[1]
 """
 
 READ = """
@@ -215,16 +215,56 @@ print(json.dumps(answers))
 """
 
 
-def _lerobot(script: str, root, rows=(), path: str = "") -> str:
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": path}
-    command = [str(PYTHON), "-c", HEAD + script, str(root), json.dumps(list(rows))]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+# The imports take ten seconds: they are made once, and every script runs in a fork of that process.
+SERVE = """
+import os, traceback
+import lerobot.policies.factory
+for line in sys.stdin:
+    asked = json.loads(line)
+    child = os.fork()
+    if child:
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+        continue
+    for stream in (1, 2):
+        os.dup2(os.open(asked["said"][stream - 1], os.O_WRONLY | os.O_CREAT), stream)
+    sys.path[:0], sys.argv[1:], root = asked["path"], asked["words"], asked["words"][0]
+    code = 1
+    try:
+        exec(asked["script"])
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+"""
 
 
-def test_lerobot_reads_what_was_recorded(recording):
-    facts = json.loads(_lerobot(READ, recording, (0, 29, 30, 44, 99)).splitlines()[-1])
+@pytest.fixture(scope="module")
+def lerobot(tmp_path_factory):
+    """lerobot(script, root, rows, path) -> what the script printed in the other environment; path is searched for modules first."""
+    folder, count = tmp_path_factory.mktemp("said"), itertools.count()
+    environment, pipe = {**os.environ, "HF_HUB_OFFLINE": "1", "PYTHONPATH": ""}, subprocess.PIPE
+    with subprocess.Popen(
+        [str(PYTHON), "-c", HEAD + SERVE], stdin=pipe, stdout=pipe, text=True, env=environment
+    ) as server:
+        assert server.stdin and server.stdout
+
+        def ran(script: str, root, rows=(), path: tuple[Path, ...] = ()) -> str:
+            number = next(count)
+            out, err = (folder / f"{number}.{stream}" for stream in ("out", "err"))
+            asked = {"script": script, "words": [str(root), json.dumps(list(rows))], "path": [str(one) for one in path]}
+            server.stdin.write(json.dumps({**asked, "said": [str(out), str(err)]}) + "\n")
+            server.stdin.flush()
+            assert server.stdout.readline() == "0\n", err.exists() and err.read_text()[-3000:]
+            return out.read_text()
+
+        yield ran
+        server.stdin.close()
+
+
+def test_lerobot_reads_what_was_recorded(recording, lerobot):
+    facts = json.loads(lerobot(READ, recording, (0, 29, 30, 44, 99)).splitlines()[-1])
     dataset = Dataset(recording)
     assert (facts["length"], facts["episodes"], facts["fps"]) == (100, 4, 35)
     for at, row in facts["rows"].items():
@@ -237,8 +277,8 @@ def test_lerobot_reads_what_was_recorded(recording):
         assert np.abs(np.array(row["observation.images.rgb"]) - mine["rgb"][place].astype(int)).mean() < 2
 
 
-def test_what_lerobot_records_opens_here(tmp_path):
-    _lerobot(WRITE, tmp_path / "theirs")
+def test_what_lerobot_records_opens_here(tmp_path, lerobot):
+    lerobot(WRITE, tmp_path / "theirs")
     dataset = Dataset(tmp_path / "theirs")
     assert dataset.length == 39 and [episode.length for episode in dataset.episodes] == [12, 13, 14]
     found = dataset.episode(2)
@@ -254,7 +294,7 @@ def test_what_lerobot_records_opens_here(tmp_path):
     assert doctor(dataset.root) == []
 
 
-def test_a_rig_and_its_conversions_open_in_lerobot(tmp_path):
+def test_a_rig_and_its_conversions_open_in_lerobot(tmp_path, lerobot):
     """Sensors with clocks of their own, resampled to rows; the same again through our own reader."""
     rng = np.random.default_rng(0)
     front, imu = np.arange(20) / 10 + 0.003, np.arange(100) / 50
@@ -276,7 +316,7 @@ def test_a_rig_and_its_conversions_open_in_lerobot(tmp_path):
     write_source(Source("rig", {sensor.name: sensor for sensor in sensors}, lambda: takes), tmp_path / "rig")
     write_source(open_source(tmp_path / "rig"), tmp_path / "again")
     for name in ("rig", "again"):
-        facts = json.loads(_lerobot(READ, tmp_path / name, (0, 7, 27, 39)).splitlines()[-1])
+        facts = json.loads(lerobot(READ, tmp_path / name, (0, 7, 27, 39)).splitlines()[-1])
         assert (facts["length"], facts["episodes"], facts["fps"]) == (40, 2, 10)
         for at, row in facts["rows"].items():
             place = int(at) % 20
@@ -288,7 +328,7 @@ def test_a_rig_and_its_conversions_open_in_lerobot(tmp_path):
             assert np.abs(np.array(row["observation.images.front"]) - 90).max() <= 2
 
 
-def test_png_merged_tables_and_statistics_open_in_lerobot(tmp_path, monkeypatch):
+def test_png_merged_tables_and_statistics_open_in_lerobot(tmp_path, monkeypatch, lerobot):
     monkeypatch.setattr("terrella.data.writer.EPISODES_PER_TABLE", 3)
     camera = Sensor("observation.images.top", "image", (16, 24, 3), "uint8")
     state = Sensor("observation.state", "vector", (2,), names=("x_m", "y_m"))
@@ -303,7 +343,7 @@ def test_png_merged_tables_and_statistics_open_in_lerobot(tmp_path, monkeypatch)
     source = Source("png", {camera.name: camera, state.name: state}, lambda: takes, 10.0)
     write_source(source, tmp_path / "png", rows=LeRobotRows(pictures="png"))
     assert len(list((tmp_path / "png/meta/episodes/chunk-000").iterdir())) == 2
-    facts = json.loads(_lerobot(READ, tmp_path / "png", (0, 8, 21)).splitlines()[-1])
+    facts = json.loads(lerobot(READ, tmp_path / "png", (0, 8, 21)).splitlines()[-1])
     assert facts["lengths"] == [4, 5, 6, 7] and facts["length"] == 22
     for at, (take, row) in {0: (0, 0), 8: (1, 4), 21: (3, 6)}.items():
         found = np.array(facts["rows"][str(at)][camera.name])
@@ -312,7 +352,7 @@ def test_png_merged_tables_and_statistics_open_in_lerobot(tmp_path, monkeypatch)
     assert np.allclose(facts["stats"][state.name], every.mean(0)) and len(facts["stats"][camera.name]) == 3
 
 
-def test_several_robots_merged_open_in_lerobot(tmp_path, recording):
+def test_several_robots_merged_open_in_lerobot(tmp_path, recording, lerobot):
     arm = Source(
         "arm",
         {
@@ -327,7 +367,7 @@ def test_several_robots_merged_open_in_lerobot(tmp_path, recording):
         "arm",
     )  # fmt: skip
     merge_into({"corridor": open_source(recording), "arm": arm}, tmp_path / "all")
-    facts = json.loads(_lerobot(READ, tmp_path / "all", (0, 104)).splitlines()[-1])
+    facts = json.loads(lerobot(READ, tmp_path / "all", (0, 104)).splitlines()[-1])
     assert facts["length"] == 109 and facts["episodes"] == 5 and facts["rows"]["104"]["task"] == "grasp"
     width = len(facts["rows"]["0"]["action"])
     assert facts["rows"]["104"]["action"] == [0.0] * (width - 1) + [0.5]
@@ -340,14 +380,14 @@ def _reach():
 
 
 @pytest.fixture(scope="module")
-def policies(tmp_path_factory):
+def policies(tmp_path_factory, lerobot):
     """Tiny untrained policies of LeRobot: ACT, ACT with a temporal ensemble, and diffusion."""
     root = tmp_path_factory.mktemp("policies")
-    _lerobot(POLICIES, root)
+    lerobot(POLICIES, root)
     return root
 
 
-def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path):
+def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path, lerobot):
     world, steps, seen = _reach(), 9, {}
     state = world.start(1, make_rng(0))
     for _ in range(steps):  # the same episode for all, under random actions
@@ -358,7 +398,7 @@ def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path):
     seeds = [chance.seeds(1, rng).item() for _ in range(steps)]
     np.savez(policies / "seen.npz", seeds=seeds, **{name: torch.cat(value).numpy() for name, value in seen.items()})
     kinds = ("act", "ensemble", "diffusion")
-    theirs = json.loads(_lerobot(ACT, policies, kinds).splitlines()[-1])
+    theirs = json.loads(lerobot(ACT, policies, kinds).splitlines()[-1])
     for kind in kinds:
         policy, rng = terrella.load_policy(policies / kind, world.spec), make_rng(7)
         memory, actions = policy.begin(1, rng), []
@@ -375,10 +415,10 @@ def test_policies_of_lerobot_act_as_they_do_there(policies, capsys, tmp_path):
         assert evaluated["rows"][kind]["real"] == evaluated["rows"][kind]["dream"] != evaluated["rows"]["idle"]["real"]
 
 
-def test_a_policy_that_lerobot_trained_on_our_recording_acts_here(tmp_path, capsys):
+def test_a_policy_that_lerobot_trained_on_our_recording_acts_here(tmp_path, capsys, lerobot):
     recording, trained = tmp_path / "recording", tmp_path / "trained"
     assert main(["record", "world", REACH, "--frames", "60", "--out", str(recording)]) == 0
-    facts = json.loads(_lerobot(TRAIN, recording, (str(trained),)).splitlines()[-1])
+    facts = json.loads(lerobot(TRAIN, recording, (str(trained),)).splitlines()[-1])
     assert {"observation.images.rgb", "observation.state"} <= set(facts["inputs"]) and np.isfinite(facts["loss"])
     capsys.readouterr()
     words = ["evaluate", str(trained), "--in", REACH, "--episodes", "2", "--out", str(tmp_path / "out")]
@@ -418,7 +458,7 @@ def _imitator(folder, spec: Spec, **settings) -> ImitationActor:
     return terrella.load_policy(folder, spec)
 
 
-def test_our_policies_act_in_lerobot_as_they_do_here(tmp_path):
+def test_our_policies_act_in_lerobot_as_they_do_here(tmp_path, lerobot):
     _imitator(tmp_path / "arm", ARM, chunk=4, execute=3, own_actions=True)
     _imitator(tmp_path / "grid", GRID, chunk=2, remember=4, vocabulary=("blue", "go", "red", "to"))
     Actor(ActorNetwork(ActorConfig.of(ARM, ("state",), 8)), ARM).save(tmp_path / "other")
@@ -448,8 +488,8 @@ def test_our_policies_act_in_lerobot_as_they_do_here(tmp_path):
     (tmp_path / "site/lerobot_policy_terrella-0.1.0.dist-info/METADATA").write_text(
         "Metadata-Version: 2.1\nName: lerobot_policy_terrella\nVersion: 0.1.0\n"
     )
-    path = os.pathsep.join(map(str, (ROOT / "src", ROOT / "plugins/lerobot_policy_terrella/src", tmp_path / "site")))
-    answers = json.loads(_lerobot(OURS, tmp_path, ("arm", "grid"), path).splitlines()[-1])
+    path = (ROOT / "src", ROOT / "plugins/lerobot_policy_terrella/src", tmp_path / "site")
+    answers = json.loads(lerobot(OURS, tmp_path, ("arm", "grid"), path).splitlines()[-1])
     for name, chunk in (("arm", [2, 4, 2]), ("grid", [2, 2, 1])):
         for place in ("there", "again"):
             answer = answers[f"{name}-{place}"]
