@@ -66,6 +66,7 @@ def test_it_learns_the_other_body_and_forgets_less_where_it_rehearses(made, tmp_
     assert adapt(world, new, tmp_path / "kept", SHORT, quiet, old)["errors"] == errors  # finished: as it was
 
 
+@pytest.mark.exact
 def test_what_cannot_adapt_is_refused_in_a_sentence(made, tmp_path):
     world, old, new = made
     with pytest.raises(DatasetError, match="are not those of doom-maze"):
@@ -123,6 +124,7 @@ def test_batches_are_joined_row_by_row():
     assert both.rgb is None and both.numbers[:, 0, 0].tolist() == [0, 0, 1, 1]
 
 
+@pytest.mark.exact
 def test_the_command_says_what_was_gained_and_what_was_forgotten(made, tmp_path, capsys):
     _, old, new = made
     run, out = str(old.parent / "run"), str(tmp_path / "out")

@@ -181,6 +181,7 @@ def test_a_world_of_a_scrolling_recording_knows_its_ground(flow_run):
     assert "batches" in check_world(world)
 
 
+@pytest.mark.exact
 def test_a_stopped_run_goes_on_exactly(flow_run, scrolling, tmp_path):
     resumes_exactly(lambda out: train_video(scrolling, out, FLAT, quiet), flow_run[0], tmp_path, {"flow": 1})
 
@@ -227,6 +228,7 @@ def test_a_student_begins_with_channels_of_its_teacher():
     assert torch.equal(part["output.weight"], weights["output.weight"])
 
 
+@pytest.mark.exact
 def test_a_student_is_a_smaller_world_of_the_same_game(scrolling, tmp_path):
     train_video(scrolling, tmp_path / "teacher", replace(FLAT, channels=(16, 8, 8), steps=8), quiet)
     teacher = load_world(tmp_path / "teacher" / "world")
@@ -242,6 +244,7 @@ def test_a_student_is_a_smaller_world_of_the_same_game(scrolling, tmp_path):
     resumes_exactly(train, tmp_path / "student", tmp_path / "cut", {"flow": 0})
 
 
+@pytest.mark.exact
 def test_its_drawing_steps_can_be_chosen(scrolling, tmp_path):
     train_video(scrolling, tmp_path, replace(FLAT, flow_steps=2, steps=3), quiet)
     assert load_world(tmp_path / "world").generator.config.steps == 2

@@ -125,6 +125,7 @@ def test_a_search_that_hardly_searches_is_better_for_its_proposals(made):
     assert ended(proposal_policy(str(folder / "run"), world)) < 0.7 * ended(None)
 
 
+@pytest.mark.exact
 def test_it_goes_on_exactly(made, tmp_path):
     world, config = Told(), replace(QUICK, steps=40)
     recording = made[0] / "recording"

@@ -328,6 +328,7 @@ def test_a_memory_in_play_is_that_of_training(fetch):
     assert memory["features"].shape == (1, 1, config.actor.hidden)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("imitation", [Imitation(), Imitation(remember=6)], ids=["history", "memory"])
 def test_a_stopped_run_goes_on_exactly(fetch, tmp_path, imitation):
     _, recording, _ = fetch
@@ -340,6 +341,7 @@ def test_a_stopped_run_goes_on_exactly(fetch, tmp_path, imitation):
     )
 
 
+@pytest.mark.exact
 def test_the_command_trains_plays_and_evaluates(fetch, tmp_path, capsys):
     _, recording, _ = fetch
     words = [

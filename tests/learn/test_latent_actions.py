@@ -108,6 +108,7 @@ def test_pictures_alone_are_enough(run, tmp_path):
         map_keys(run, silent, quiet)
 
 
+@pytest.mark.exact
 def test_a_stopped_run_goes_on_exactly(recording, tmp_path):
     config = replace(CONFIG, steps=4, batch=4)
     train = lambda out: train_latent_actions(recording, out, config, quiet)  # noqa: E731

@@ -59,6 +59,7 @@ def tame(world):
     return world.replaced(generator=generator)
 
 
+@pytest.mark.exact
 def test_distilling_gives_a_world_of_one_step_that_keeps_the_contract(student_run, student, teacher):
     out, facts = student_run
     assert facts["step"] == 3 and student.config.steps == 1
@@ -74,6 +75,7 @@ def test_a_stopped_distillation_goes_on_exactly(corridor, teacher, student_run, 
     resumes_exactly(lambda out: distil(teacher, corridor, out, STUDENT, quiet), student_run[0], tmp_path, {"distil": 0})
 
 
+@pytest.mark.exact
 def test_a_stopped_training_on_dreams_goes_on_exactly(corridor, teacher, dreams_run, tmp_path):
     resumes_exactly(
         lambda out: train_dreams(teacher, corridor, out, DREAMS, quiet), dreams_run[0], tmp_path, {"dreams": 0}
@@ -212,6 +214,7 @@ def test_a_world_of_one_step_teaches_nobody(corridor, places, tmp_path):
         distil(places, corridor, tmp_path, STUDENT, quiet)
 
 
+@pytest.mark.exact
 def test_flat_worlds_learn_no_dreams_and_teach_smaller_ones_alone(flat_run, corridor, tmp_path):
     flat = load_world(flat_run[0] / "world")
     with pytest.raises(TrainingError, match="for worlds that have"):

@@ -130,6 +130,7 @@ def test_choices_are_learned_from_what_pays(tmp_path) -> None:
     assert mine > 0.6 * idle  # both are below 0
 
 
+@pytest.mark.exact
 def test_a_stopped_run_goes_on_exactly(tmp_path) -> None:
     config = replace(QUICK, steps=16, batch=8, hidden=8)
     for name, world in (("point", Point()), ("grid", Grid()), ("recalls", Recalls())):

@@ -178,6 +178,7 @@ def test_its_uncertainty_is_calibrated_as_far_as_the_episodes_reach(run, vectors
     assert 2 * last_knot[4] < last_knot[512] and last_knot[512] > float(rolled.spread[32].mean())
 
 
+@pytest.mark.exact
 def test_a_stopped_run_goes_on_exactly(vectors, tmp_path):
     config = LatentTraining(steps=24, batch=8, latent=8, rollout=3, strip_every_s=1e9)
     goes_on_exactly(
@@ -185,6 +186,7 @@ def test_a_stopped_run_goes_on_exactly(vectors, tmp_path):
     )
 
 
+@pytest.mark.exact
 def test_a_kill_while_validating_leaves_the_trained_world(vectors, tmp_path, monkeypatch):
     def killed(*_):
         raise KeyboardInterrupt
@@ -205,6 +207,7 @@ def test_a_finished_run_says_again_what_it_found(run, vectors):
     assert train_latent(vectors, run[0], QUICK, quiet) == run[1]
 
 
+@pytest.mark.exact
 def test_pictures_of_an_odd_size_are_seen_and_decoded(tmp_path):
     data = drifting(tmp_path / "data", pictures=(37, 90), episodes=4, length=30)
     config = LatentTraining(steps=8, batch=4, latent=8, rollout=2, strip_every_s=1e9)

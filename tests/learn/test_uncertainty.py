@@ -63,6 +63,7 @@ def test_an_estimator_learns(tmp_path):
     assert off[1] < 0.8 * off[0], off
 
 
+@pytest.mark.exact
 def test_a_stopped_run_goes_on_exactly(corridor, tmp_path):
     def train(out):
         facts = train_estimator(corridor, out, EstimatorTraining((16, 32), 3, 2), quiet)
@@ -235,6 +236,7 @@ def test_neighbours_that_fall_are_pooled():
     assert pool_adjacent_violators([3.0, 2.0, 1.0], [1, 1, 1]) == pytest.approx([2.0, 2.0, 2.0])
 
 
+@pytest.mark.exact
 def test_a_finished_run_is_not_taught_again(corridor, posed_run, tmp_path, monkeypatch):
     def fail(*_):
         raise AssertionError("it was taught again")

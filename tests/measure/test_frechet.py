@@ -164,6 +164,7 @@ def reclad(frames: torch.Tensor, count: float) -> torch.Tensor:
     return out
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     ("spoil", "levels"),
     [
@@ -181,6 +182,7 @@ def test_it_rises_with_everything_that_spoils_a_picture(game, plain, spoil, leve
     assert values == sorted(values) and found[-1].low > 0
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(("spoil", "level"), [(blurred, 1.2), (noisy, 10), (tinted, 24), (blocky, 8)])
 def test_spoilt_pictures_of_other_moments_are_told_from_real_ones(game, plain, halves, spoil, level):
     assert frechet_interval(plain, frame_features(spoil(game[1::2], level))).low > halves.high

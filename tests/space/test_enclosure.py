@@ -132,6 +132,7 @@ def test_auto_tells_indoors_from_outdoors(room):
     assert kind_of_place(Occupancy.of(field), torch.tensor([4.0, 4, 1.6])) == "outdoor"
 
 
+@pytest.mark.exact
 def test_an_imported_place_is_closed_and_a_wrong_point_is_refused(tmp_path, room, capsys):
     write_scene(room, tmp_path / "room.ply")
     given = ["space", "import", str(tmp_path / "room.ply"), "--out", str(tmp_path / "w")]
@@ -148,6 +149,7 @@ def test_an_imported_place_is_closed_and_a_wrong_point_is_refused(tmp_path, room
     assert "--inside 90 2 1.6 is not in free space" in capsys.readouterr().err
 
 
+@pytest.mark.exact
 def test_a_collider_is_computed_once_and_anew_after_an_edit(tmp_path, room, monkeypatch):
     write_scene(room, tmp_path / "room.ply")
     assert main(["space", "import", str(tmp_path / "room.ply"), "--out", str(tmp_path / "w")]) == 0

@@ -121,6 +121,7 @@ def test_what_would_cover_a_seen_surface_is_left_out():
     assert growing._covers(front(), points, cameras)[0].tolist() == [True, True, False, False, False]
 
 
+@pytest.mark.exact
 def test_a_place_grows_is_undone_and_goes_on(tmp_path, capsys):
     place = half_room(tmp_path / "place")
     name = str(tmp_path / "place")

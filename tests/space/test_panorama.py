@@ -105,6 +105,7 @@ def test_a_wide_picture_that_could_be_a_panorama_is_said_to_be_none(tmp_path):
     assert "edges do not meet (--panorama" in facts["notes"][0]
 
 
+@pytest.mark.exact
 def test_panoramas_go_in_and_come_out(tmp_path, capsys):
     picture = (255 * room(160).rgb.permute(1, 2, 0)).byte().numpy()
     Image.fromarray(picture).save(tmp_path / "all.png")

@@ -58,6 +58,7 @@ WORLDS = {
 }
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("name", WORLDS)
 def test_a_step_is_few_kernels_without_a_wait_whatever_the_batch(name, monkeypatch):
     make, most = WORLDS[name]

@@ -162,7 +162,7 @@ def test_fast_is_for_learned_worlds(capsys):
     assert "only a learned world can be drawn faster" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("quick", [True, False])
+@pytest.mark.parametrize("quick", [True, pytest.param(False, marks=pytest.mark.exact)])
 def test_steps_are_programs_where_that_is_faster(quick, monkeypatch):
     monkeypatch.setattr(fast, "alternating_ms", lambda ways: [2.0, 1.0 if quick else 3.0])
     world = place(Controls.buttons(3))

@@ -40,7 +40,7 @@ def test_it_is_a_world_of_pictures_and_says_how_it_is_played(world):
     "action, way",
     [
         ("right", (-2, 0)),
-        ("down", (0, -2)),
+        pytest.param("down", (0, -2), marks=pytest.mark.exact),
         *(pytest.param(*other, marks=pytest.mark.slow) for other in (("left", (2, 0)), ("up", (0, 2)))),
     ],
 )

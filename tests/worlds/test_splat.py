@@ -82,6 +82,7 @@ def test_a_picture_changes_the_place_of_its_episode_alone(tmp_path):
         world.observe({"rgb": red, "depth": before["depth"][:1], "pose": state["pose"]}, state, rng)
 
 
+@pytest.mark.exact
 def test_a_file_becomes_a_world_and_a_file_again(tmp_path, capsys):
     write_scene(room(), tmp_path / "room.ply")
     assert (

@@ -99,6 +99,7 @@ def test_where_a_step_cannot_be_captured_it_runs_as_it_is(monkeypatch):
     assert (run, way) == (list, "traced")
 
 
+@pytest.mark.exact
 def test_without_a_compiler_a_step_runs_as_it_is(monkeypatch):
     world = place(Controls.buttons(3))
 
