@@ -31,7 +31,7 @@ OPTIONS = {
     "learn": "--action-names --adapter --batch --device --fps --frames --idle --json --keys --minutes --no-compile --no-half --out "
     "--policy --practise --preset --randomise --seed --size --student --task --workers",
     "record doom": "--frames --height --human --json --live-mcap --out --port --scenario --seed --skill",
-    "record world": "--action-names --adapter --episodes --fps --frames --human --idle --json --keys --live-mcap --on --out "
+    "record world": "--action-names --adapter --episodes --fps --frames --human --idle --in --json --keys --live-mcap --on --out "
     "--pictures --policy --port --randomise --seed --size --task --workers",
     "play": "--action-names --agent --agent-ms --compare --device --estimator --fast --fps --host --idle --image --json --keys "
     "--memory-mb --no-memory --policy --port --randomise --record --remember --seed --token --truth --watts",
@@ -483,6 +483,7 @@ def test_whole_episodes_of_a_policy_are_recorded_by_workers_and_again(capsys, tm
         (["--episodes", "3", "--frames", "9"], "how much"),
         (["--episodes", "0"], "how much to record"),
         (["--policy", "explroer"], "did you mean 'explorer'"),
+        (["--in", "gym:CartPole-v1"], "--in is for a --policy"),
     ],
 )
 def test_who_plays_and_how_much_is_checked(more, said, capsys, tmp_path):

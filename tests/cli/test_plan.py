@@ -19,6 +19,7 @@ from terrella.act.planning.costs import checked_goal
 from terrella.cli import main
 from terrella.core import Spec
 from terrella.core.errors import ObservationError, TerrellaError
+from terrella.data import Dataset
 from terrella.sim.randomised import Randomised
 from terrella.workflows.opening import EnvironmentConfig
 from terrella.workflows.plan_energy import DECISIONS
@@ -298,3 +299,15 @@ def test_planning_from_python(tmp_path):
     )
     assert "No film: the environment shows no pictures." in lines
     json.dumps(result.to_json(), allow_nan=False)
+
+
+def test_what_is_planned_in_a_learned_world_is_recorded_in_the_environment(capsys, tmp_path):
+    first, run, more = (str(tmp_path / name) for name in ("first", "run", "more"))
+    assert main(["record", "world", NAME, "--policy", "random", "--frames", "400", "--out", first]) == 0
+    small = ["--steps", "2", "--latent", "4", "--hidden", "8", "--members", "1", "--rollout", "1"]
+    assert main(["train", "latent", first, "--out", run, *small]) == 0
+    words = ["--in", run, "--policy", "plan:samples=2,iterations=1,horizon=1", "--out", more]
+    assert main(["record", "world", NAME, "--frames", "20", *words]) == 0
+    assert Dataset(more).episode(0)["rgb"].shape[1:] == (16, 32, 3)  # as the world sees them
+    assert main(["record", "world", "gym:CartPole-v1", *words]) == 2
+    assert "differ" in capsys.readouterr().err

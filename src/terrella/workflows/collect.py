@@ -5,7 +5,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
 
 from .. import library
 from ..act.explorer import Explorer
@@ -18,8 +20,9 @@ from ..data import Dataset, Layout, Recorder, RecordOptions, record
 from ..data.collect import Job, LocalWorkers
 from ..data.collect import collect as collect_episodes
 from ..data.ray import RayWorkers
-from .opening import ControlsConfig, EnvironmentConfig
+from .opening import ControlsConfig, EnvironmentConfig, load_named
 from .progress import Progress, Report, silent, stage
+from .real_environment import check_alike, open_real
 from .recording_facts import describe, recording_facts
 from .results import jsonable
 
@@ -61,6 +64,9 @@ class CollectConfig(RecordConfig):
     """"png" is lossless, "video" is H.264, "auto" is png up to 96 pixels a side and video above; "none" draws none."""
     policy: str | None = None
     """explorer, random, idle, plan, constant:VALUE, the folder of a learned policy, MODULE:NAME or FILE.py:NAME."""
+    inside: Annotated[str | None, arg(name="in")] = None
+    """The world in which the policy `plan` plans, or through which a learned policy acts; default: the recorded one. Pictures
+    have its size."""
     episodes: int | None = None  # Whole episodes to record in all, in place of --frames.
     workers: int | None = None
     """Processes that play at the same time, an episode each; the recording is the same with any number of them."""
@@ -81,6 +87,10 @@ class CollectConfig(RecordConfig):
             raise TerrellaError("--human and --policy both say who plays; give one of them.")
         if self.frames is not None and self.episodes is not None:
             raise TerrellaError("--frames and --episodes both say how much to record; give one of them.")
+        if self.inside and self.policy in (None, "explorer"):
+            raise TerrellaError(
+                "--in is for a --policy that plans or acts in a world: plan, or a learned one's folder."
+            )
 
 
 @dataclass(frozen=True)
@@ -105,7 +115,7 @@ def collect(world: str | Path, config: CollectConfig, *, progress: Progress = si
     """
     config.check()
     rgb, policy = config.pictures != "none", config.policy or "explorer"
-    make = partial(open_player, str(world), config.controls, config.environment, rgb, policy)
+    make = partial(open_player, str(world), config.controls, config.environment, rgb, policy, config.inside)
     opened, make_policy = make()
     for line in describe(opened.spec):
         progress(line)
@@ -125,10 +135,23 @@ def collect_doom(config: DoomRecordConfig, *, progress: Progress = silent) -> Co
     return _record(world, config, config.frames, "video", None, progress)
 
 
-def open_player(name: str, controls: ControlsConfig, environment: EnvironmentConfig, rgb: bool, policy: str):
-    """A world, and a function that makes its policy: in a worker, too."""
-    world = controls.of(environment.open(name, rgb=rgb))
-    return world, lambda: policy_of(policy, world.spec, world)
+def open_player(
+    name: str,
+    controls: ControlsConfig,
+    environment: EnvironmentConfig,
+    rgb: bool,
+    policy: str,
+    inside: str | None = None,
+):
+    """A world, and a function that makes its policy: in a worker, too. inside: the world in which the policy plans or acts;
+    TerrellaError where it does not fit."""
+    if inside is None:
+        world = controls.of(environment.open(name, rgb=rgb))
+        return world, lambda: policy_of(policy, world.spec, world)
+    learned = load_named(inside, "cpu")
+    world = controls.of(open_real(name, environment, learned.spec, rgb))
+    check_alike(learned.spec, world.spec)
+    return world, lambda: policy_of(policy, world.spec, learned)
 
 
 def storage_of(spec: Spec) -> Stored:
