@@ -298,6 +298,13 @@ def test_the_verdict_says_how_far_to_plan_and_what_is_lost():
     assert "after 8 steps; it has one action" in verdict(arms(0.1, 0.1, 0.4), {}, acts=False)
 
 
+def test_where_no_recorded_episode_ended_none_ends_in_a_rollout(vectors, tmp_path):
+    train_latent(vectors, tmp_path / "run", replace(QUICK, steps=1), quiet)
+    world = terrella.load(tmp_path / "run")
+    state = world.imagine(world.start(8, make_rng(0)), torch.zeros(8, 1), make_rng(1))
+    assert float(world.render(state, ["done_probability"])["done_probability"].max()) < 1e-6
+
+
 def test_fewer_clips_than_a_batch_are_one_batch(tmp_path):
     few = drifting(tmp_path / "few", episodes=9, length=12)
     assert train_latent(few, tmp_path / "run", replace(QUICK, steps=2, batch=128), quiet)["step"] == 2

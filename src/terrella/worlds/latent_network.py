@@ -12,6 +12,7 @@ from ..core.spec import kind_of
 KNOTS = 17  # of the map from the spread of the ensemble to the error to expect
 FARTHEST = 8.0  # standard deviations to which latents and inputs are clamped
 COARSE = 16  # side in pixels of a cell of the encoder's last map
+NEVER = -30.0  # the logit of an end
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class LatentConfig:
     identity: bool = False  # the latent is the scaled vectors, all of which are evidence; there is no encoder
     frames: int = 1  # last pictures that a latent is made of
     glance: int = 64  # width of what is kept of a picture for the latents after it
+    ends: bool = True  # whether an episode that it learned from ended; if none did, none ends in a rollout
 
     @property
     def width(self) -> int:
@@ -245,7 +247,8 @@ class LatentNetwork(nn.Module):
     def outcome(self, window: torch.Tensor, action: torch.Tensor, after: torch.Tensor) -> Outcomes:
         """Of a step from `window` by `action` [B, A] to the latent `after` [B, D]."""
         logits = self.heads["outcome"](torch.cat([window.flatten(1), action, after], 1))
-        return Outcomes(logits[:, :-1], logits[:, -1])
+        done = logits[:, -1] if self.config.ends else torch.full_like(logits[:, -1], NEVER)
+        return Outcomes(logits[:, :-1], done)
 
     def expected_reward(self, logits: torch.Tensor) -> torch.Tensor:
         """The reward expected [B]."""

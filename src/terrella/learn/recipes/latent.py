@@ -169,6 +169,12 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
     return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
 
 
+def _has_ends(recording: Recording) -> bool:
+    """Whether an episode ended; a limit of steps is no end. Otherwise planners would find ends that the world makes up."""
+    done = recording.cache.done
+    return done is not None and bool(np.any(done))
+
+
 class _Training:
     """The network of a latent world and its training."""
 
@@ -178,6 +184,7 @@ class _Training:
         self.controls = recording.controls
         self.sees_pictures = recording.cache.rgb is not None and config.pictures
         shape = self._shape() if begin is None else begin.world.network.config
+        shape = replace(shape, ends=_has_ends(recording) or (begin is not None and shape.ends))
         seen = [name for name, _ in shape.vectors] + ["rgb"] * self.sees_pictures
         self.recording = recording = recording.having(seen)
         self.network = LatentNetwork(shape).to(run.device)
