@@ -106,6 +106,18 @@ def test_levels_and_shares_are_those_of_the_recording(learned):
     assert len(many) <= 33 and list(many) == sorted(set(many))
 
 
+def test_a_vital_that_changes_at_ends_alone_has_its_size_after_them(learned):
+    _, _, happened, _ = learned
+    ended = (happened.real & happened.done).astype(np.float32)[:, None]
+    flag = replace(happened, vitals=np.zeros_like(ended), change=7 * ended, names=("collision",))
+    outcome = FrameOutcome(flag.config())
+    assert flag.config().spans == (7.0,), "not 1e-6, which would make a logit of 4 million of it"
+    logit = outcome.ends(torch.zeros(1, outcome.ending.in_features - 2), torch.full((1, 1), 7.0))
+    assert logit.abs().item() < 10
+    never = replace(flag, change=np.zeros_like(ended))
+    assert never.config().spans == (1.0,)
+
+
 def test_rewards_and_vitals_that_vary_all_the_time_are_no_events(learned):
     _, _, happened, _ = learned
     rewarded = happened.reward != 0

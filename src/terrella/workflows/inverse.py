@@ -214,7 +214,13 @@ def _compare(
 ) -> dict[str, torch.Tensor]:
     """Returns [episodes] in the real environment, of random actions and of a policy of each arm."""
     training, weight = config.training, torch.from_numpy(sure)
-    practice = Practice(sees=training.sees, steps=config.policy_steps, hidden=training.hidden, seed=training.seed)
+    practice = Practice(
+        sees=training.sees,
+        steps=config.policy_steps,
+        batch=training.batch,
+        hidden=training.hidden,
+        seed=training.seed,
+    )
     arms: dict[str, Callable[[DemonstrationRows], DemonstrationRows]] = {
         "labelled only": lambda rows: rows.of_episodes(labelled),
         "pseudo-labelled": lambda rows: replace(rows, actions=actions, weight=weight),

@@ -64,9 +64,9 @@ class Happenings:
     def config(self, cameras: int = 1) -> OutcomeConfig:
         """Of frames in which the pictures of this many cameras lie side by side."""
         changes = tuple(levels(self.change[self.real, column]) for column in range(len(self.names)))
-        spans = tuple(
-            float(max(np.abs(self.vitals[self.real, column]).max(), 1e-6)) for column in range(len(self.names))
-        )
+        before, change = self.vitals[self.real], self.change[self.real]
+        largest = np.maximum(np.abs(before), np.abs(before + change)).max(0, initial=0)  # some change at the end alone
+        spans = tuple(float(span) or 1.0 for span in largest)
         rewards, side = levels(self.reward[self.real]), OutcomeConfig.side * cameras
         return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, spans, side=side)
 
