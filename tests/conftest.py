@@ -46,7 +46,7 @@ def browser():
 
 
 # The folders with the longest files, longest first: what comes last is short, so no worker waits long for the other.
-LONG = ("tests", "learn", "serve", "worlds", "cli", "space", "sim", "measure")
+LONG = ("tests", "learn", "physics", "serve", "worlds", "cli", "space", "sim", "measure")
 
 
 def pytest_collection_modifyitems(items):

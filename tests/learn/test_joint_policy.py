@@ -89,7 +89,7 @@ def bodies(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bodies")
     worlds = {name: GymnasiumWorld(f"Terrella{name}-v0") for name in BODIES}
     for name, world in worlds.items():
-        record(world, Teacher(name), folder / name, 300, make_rng(0))
+        record(world, Teacher(name), folder / name, 200, make_rng(0))
     return worlds, {name: folder / name for name in BODIES}, folder
 
 

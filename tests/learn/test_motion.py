@@ -84,7 +84,7 @@ def walks(episodes: int = 90, length: int = 40) -> Recording:
 def test_drag_thrust_turning_and_body_come_out_of_the_recording(tmp_path):
     torch.manual_seed(0)
     motion = Motion(MotionConfig(actions=3, history=2))
-    found = learn_motion(Run(tmp_path, {}, quiet), motion, walks(), keyframes(), 1500)
+    found = learn_motion(Run(tmp_path, {}, quiet), motion, walks(), keyframes(), 600)
     assert found["body_m"] == pytest.approx(BODY, abs=0.01)
     assert found["short"] == SHORT
     assert found["motion_error_m"] < 0.02
