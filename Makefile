@@ -7,6 +7,9 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	$$python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14))' 2>/dev/null \
 	&& { echo $$python; break; }; done)
 
+# Compiled once, not in each of the processes that the tests start.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: help play test test-all test-portable test-lerobot test-splats judge judge-cube check check-types check-style format bench bench-gpu clean
 help:
 	@echo "make play    open a page of worlds and places to step into: prints its address"
