@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from terrella import library
 from terrella.cli import main
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
+from terrella.learn.presets import PRESETS
 from terrella.learn.recipes.video import TrainConfig, TrainingPace
 from terrella.learn.trainer import Trainer
 from terrella.workflows.collect import explore
@@ -80,11 +82,17 @@ def test_a_student_is_learned_and_scored_beside_its_world(tmp_path, capsys, monk
     monkeypatch.setattr("terrella.workflows.learn.ENDLESS", 8)
     monkeypatch.setattr("terrella.workflows.learn.CLIP_COUNTS", (3,))
     monkeypatch.setattr("terrella.workflows.learn.time_environment", lambda *_: None)
+    narrow = tuple(replace(one, channels=tuple(wide // 64 * 8 + 8 for wide in one.channels)) for one in PRESETS)
+    for module in ("workflows.learn", "learn.presets", "learn.recipes.student"):
+        monkeypatch.setattr(f"terrella.{module}.PRESETS", narrow)
     asked = [*command(tmp_path / "two"), "--student"]
     assert main([*asked, "--preset", "medium", "--batch", "1", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     student, teacher = (load_world(Path(told[name]) / "world") for name in ("student", "world"))
-    assert (student.generator.config.channels, teacher.generator.config.channels) == ((64, 112, 160), (144, 256, 352))
+    assert (student.generator.config.channels, teacher.generator.config.channels) == (
+        narrow[0].channels,
+        narrow[1].channels,
+    )
     assert any(line.startswith("two-student is ") for line in told["verdict"])
     assert "two-student" in Path(told["card"]).read_text()
 
