@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -130,6 +131,20 @@ def test_a_moving_paddle_does_not_scroll_the_picture(recording, tmp_path):
         recorder.end_episode()
     walled = Recording.open(tmp_path / "set", SIZE, quiet)
     assert [len(Scrolling.of(one, 0, 1 << 20).moves) for one in (walled, recording)] == [1, 3]
+
+
+def test_a_room_that_one_turns_in_does_not_scroll():
+    """Parts go on by 3, 7 and 12 pixels, in each fifth step all by 3: of the other steps that move explains a quarter."""
+    wall = torch.randint(0, 256, (3, 48, 3000), dtype=torch.uint8, generator=make_rng(0))
+    frames, at = [], [0, 0, 0]
+    for row in range(200):
+        parts = zip(wall.split((12, 24, 12), 1), at)
+        frames.append(torch.cat([part[..., x : x + 64] for part, x in parts], 1))
+        at = [x + step for x, step in zip(at, (3, 7, 12) if row % 5 else (3, 3, 3))]
+    turned = SimpleNamespace(
+        rows_within=lambda before, after: np.arange(1, len(frames)), rgb=lambda rows: torch.stack(frames)[rows]
+    )
+    assert len(Scrolling.of(turned, 0, 1 << 20).moves) == 1
 
 
 def learned(share: float) -> list[float]:

@@ -54,15 +54,18 @@ class Scrolling:
         most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
         some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves = F.pad(frequent_moves(before[some], after[some], MOVES), (0, 0, 1, 0))
-        index, over = scroll_index(before, after, moves), overlay(before, after, moves)
-        kept = [0]
-        for number in range(1, len(moves)):
-            at = (index == number).nonzero().flatten()
-            if len(at) >= SCROLLS * len(rows):
-                carried = [carry(before[part], index[part], moves, over) for part in at.split(256)]
-                if changed_pixels(torch.cat(carried), after[at]).mean() <= HALF * still[at].mean():
-                    kept.append(number)
-        return Scrolling(moves[kept], over & (len(kept) > 1))
+        over = overlay(before, after, moves)
+        while True:  # until each holds for the pictures that the kept ones are chosen for
+            index, kept = scroll_index(before, after, moves), [0]
+            for number in range(1, len(moves)):
+                at = (index == number).nonzero().flatten()
+                if len(at) >= SCROLLS * len(rows):
+                    carried = [carry(before[part], index[part], moves, over) for part in at.split(256)]
+                    if changed_pixels(torch.cat(carried), after[at]).mean() <= HALF * still[at].mean():
+                        kept.append(number)
+            if len(kept) == len(moves):
+                return Scrolling(moves, over & (len(moves) > 1))
+            moves = moves[kept]
 
     @staticmethod
     def read(run: Path, recipe: Mapping) -> Scrolling | None:
