@@ -484,6 +484,9 @@ def test_whole_episodes_of_a_policy_are_recorded_by_workers_and_again(capsys, tm
         (["--episodes", "0"], "how much to record"),
         (["--policy", "explroer"], "did you mean 'explorer'"),
         (["--in", "gym:CartPole-v1"], "--in is for a --policy"),
+        (["--in", "gym:CartPole-v1", "--policy", "random"], "--in is for a --policy"),
+        (["--in", "gym:CartPole-v1", "--policy", "explorer@0.3"], "--in is for a --policy"),
+        (["--in", "gym:CartPole-v1", "--policy", "plan", "--randomise", "no.toml"], "without --in"),
     ],
 )
 def test_who_plays_and_how_much_is_checked(more, said, capsys, tmp_path):

@@ -147,6 +147,31 @@ def test_a_room_that_one_turns_in_does_not_scroll():
     assert len(Scrolling.of(turned, 0, 1 << 20).moves) == 1
 
 
+def test_where_pictures_change_as_a_whole_a_critic_judges_what_is_sampled():
+    torch.manual_seed(0)
+    one, other = (
+        FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16), recalls=each)) for each in (True, False)
+    )
+    objective = FlowFrames(one, 5e-3, 1, 4.0)
+    assert "critic" in objective.modules and "critic" not in FlowFrames(other, 5e-3, 1, 4.0).modules
+    frames = torch.randint(0, 256, (8, 3, 3, 16, 16), dtype=torch.uint8, generator=make_rng(0))
+    kept = (
+        frames[:, :KEPT].expand(-1, 3, -1, -1, -1)[:, :1].expand(-1, KEPT, -1, -1, -1),
+        torch.full((8, KEPT, 192), EMPTY),
+    )
+    batch = FlowClips(frames, torch.zeros(8, 3, 1), None, *kept)
+    named = {}
+    for share in (0.0, 0.9):
+        now = TrainStep(0, share, torch.device("cpu"), np.random.default_rng(0), make_rng(0))
+        named[share] = [loss.learner for loss in objective.losses(batch, now)]
+    assert named == {0.0: ["generator"], 0.9: ["generator", "critic"]}
+    critic = objective.critic
+    assert critic is not None
+    drawn, last = torch.rand(4, 3, 16, 16), (torch.rand(4, 3, 16, 16), torch.rand(4, 3, 16, 16))
+    pull = objective._pull(critic, drawn, last, torch.tensor([True, False, True, False]), now)
+    assert pull[[0, 2]].abs().amax((1, 2, 3)).min() > 0 and not pull[[1, 3]].any(), "drafts stay means"
+
+
 def learned(share: float) -> list[float]:
     """Losses of drafts of a dot that moves by two pixels, before and after 60 gradient steps."""
     torch.manual_seed(0)

@@ -9,23 +9,30 @@ from ..space.keyframes import Glimpse
 from .batches import Batch
 from .learners import Learner
 
+GLIMPSED = 3 + 3 + 1  # maps of a frame and the glimpse of memory
+
 
 class PatchCritic(nn.Module):
-    """Classifies 16-pixel patches as recorded or generated, given the glimpse of memory (hinge loss)."""
+    """Classifies 16-pixel patches as recorded or generated (hinge loss), by maps [B, inputs, H, W] of a frame and of what is known
+    of it."""
 
-    def __init__(self):
+    def __init__(self, inputs: int):
         super().__init__()
-        widths = (3 + 3 + 1, 32, 48, 64)
+        widths = (inputs, 32, 48, 64)
         self.layers = nn.ModuleList(
             nn.utils.parametrizations.spectral_norm(nn.Conv2d(a, b, 4, 2, 1)) for a, b in zip(widths, widths[1:])
         )
         self.judge = nn.utils.parametrizations.spectral_norm(nn.Conv2d(widths[-1], 1, 3, 1, 1))
 
-    def forward(self, rgb: torch.Tensor, glimpse) -> torch.Tensor:
-        x = torch.cat([rgb, glimpse.merged * 2 - 1, glimpse.known[:, None]], 1)
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
         for layer in self.layers:
             x = F.leaky_relu(layer(x), 0.2)
         return self.judge(x)
+
+
+def glimpsed(rgb: torch.Tensor, glimpse: Glimpse) -> torch.Tensor:
+    """The maps [B, GLIMPSED, H, W] of frames [B, 3, H, W] and the glimpse of memory."""
+    return torch.cat([rgb, glimpse.merged * 2 - 1, glimpse.known[:, None]], 1)
 
 
 def critic_pull(
@@ -35,12 +42,18 @@ def critic_pull(
     strongest where memory knows nothing: there the loss alone would draw a mean of all that is possible."""
     drawn = clean.detach()[:, :3].requires_grad_()
     with half_precision(clean.device):
-        realness = critic(drawn, glimpse).float()
+        realness = critic(glimpsed(drawn, glimpse)).float()
     known = glimpse.known[:, None]
     if clean.shape[1] > 4:  # what moves is not known
         known = known * (1 - clean.detach()[:, 4:].sigmoid())
     invented = 1 - F.adaptive_avg_pool2d(known, realness.shape[-2:])
     (pull,) = torch.autograd.grad(-(realness * (0.2 + 0.8 * invented)).mean(), drawn)
+    return scaled_pull(clean, loss, pull, weight)
+
+
+def scaled_pull(clean: torch.Tensor, loss: torch.Tensor, pull: torch.Tensor, weight: float) -> torch.Tensor:
+    """A loss of the colours of generated frames [B, 3 or more, H, W] with the gradient `pull` [B, 3, H, W], scaled to `weight`
+    times that of `loss`."""
     (own,) = torch.autograd.grad(loss, clean, retain_graph=True)
     return (clean[:, :3] * (weight * own[:, :3].norm() / pull.norm().clamp_min(1e-12) * pull)).sum()
 
@@ -93,7 +106,7 @@ def critic_loss(
 ) -> torch.Tensor:
     """Hinge loss on generated frames, given `shown`, and recorded ones, given `led`; frames [B, 3 or more, H, W]."""
     with half_precision(fake.device):
-        true, drawn = critic(real[:, :3], led), critic(fake.detach()[:, :3], shown)
+        true, drawn = critic(glimpsed(real[:, :3], led)), critic(glimpsed(fake.detach()[:, :3], shown))
         return F.relu(1 - true).mean() + F.relu(1 + drawn).mean()
 
 

@@ -54,9 +54,8 @@ class Scrolling:
         most = max(32, pixels // before[0, 0].numel())  # pairs: each is matched at 625 displacements
         some = rng.choice(len(rows), min(len(rows), most), replace=False, p=change / change.sum())
         moves = F.pad(frequent_moves(before[some], after[some], MOVES), (0, 0, 1, 0))
-        over = overlay(before, after, moves)
         while True:  # until each holds for the pictures that the kept ones are chosen for
-            index, kept = scroll_index(before, after, moves), [0]
+            index, over, kept = scroll_index(before, after, moves), overlay(before, after, moves), [0]
             for number in range(1, len(moves)):
                 at = (index == number).nonzero().flatten()
                 if len(at) >= SCROLLS * len(rows):

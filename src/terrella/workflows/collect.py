@@ -1,5 +1,6 @@
 """`collect`: a policy's or a person's episodes of a world become a recording."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -65,8 +66,8 @@ class CollectConfig(RecordConfig):
     policy: str | None = None
     """explorer, random, idle, plan, constant:VALUE, the folder of a learned policy, MODULE:NAME or FILE.py:NAME."""
     inside: Annotated[str | None, arg(name="in")] = None
-    """The world in which the policy `plan` plans, or through which a learned policy acts; default: the recorded one. Pictures
-    have its size."""
+    """The world in which the policy `plan` plans, or through which a learned policy acts; default: the recorded one. It gives the
+    default size of a Gymnasium environment's pictures."""
     episodes: int | None = None  # Whole episodes to record in all, in place of --frames.
     workers: int | None = None
     """Processes that play at the same time, an episode each; the recording is the same with any number of them."""
@@ -87,10 +88,13 @@ class CollectConfig(RecordConfig):
             raise TerrellaError("--human and --policy both say who plays; give one of them.")
         if self.frames is not None and self.episodes is not None:
             raise TerrellaError("--frames and --episodes both say how much to record; give one of them.")
-        if self.inside and self.policy in (None, "explorer"):
+        named = re.split("[@:]", self.policy or "")[0]
+        if self.inside and named != "plan" and not (named and Path(named).is_dir()):
             raise TerrellaError(
                 "--in is for a --policy that plans or acts in a world: plan, or a learned one's folder."
             )
+        if self.inside and self.environment.randomise is not None:
+            raise TerrellaError("--randomise is for a simulator that is recorded without --in; leave one of them out.")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from ...space.matching import scroll_index
 from ...space.recall import EMPTY, KEPT, keys_of
@@ -15,6 +16,7 @@ from ...worlds.flow import FlowFeatures, FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..devices import Captured, Compiled
 from ..learners import Ema, warmup_cosine
+from ..losses import PatchCritic, critic_learner, scaled_pull
 from ..moves import StitchedEpisodes
 from ..muon import muon
 from ..train_step import TrainStep
@@ -23,6 +25,8 @@ from ..trainer import Loss
 NOISED, MOST_NOISE = 0.5, 0.15  # the part of histories with added noise, and its largest deviation, of colours in -1..1
 CHANGED = 8  # difference of 255 by which a pixel changes
 DRAFTS = 0.4  # the part of the training that learns drafts alone
+FRAMES_JUDGED = 3  # what the critic sees: a frame, its change, and the change before
+CRITIC_WEIGHT = 0.5  # of the critic's gradient, relative to the loss
 LATEST = 0.9  # the largest flow time in training
 # Parts of the clips that see no memory, and all of it; the others see what the last frame showed.
 BLIND, WHOLE = 0.4, 0.3
@@ -105,6 +109,17 @@ class EarlierFrames:
         return frames, torch.where(some[:, None, None], keys_of(frames / 255), EMPTY)
 
 
+def _after(frames: torch.Tensor, last: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+    """What the critic sees of frames [B, 3, H, W] after the last frame and its change."""
+    return torch.cat([frames, frames - last[0], last[1]], 1)
+
+
+def _mean_of(maps: torch.Tensor, which: torch.Tensor) -> torch.Tensor:
+    """The mean of the maps [B, ...] `which` (bool [B]); 0 of none."""
+    weight = which.float()
+    return (maps.flatten(1).mean(1) * weight).sum() / weight.sum().clamp_min(1)
+
+
 def preference(changed):
     """The sampling weight of clips by the largest part of the pixels that a step of them changes."""
     return 0.2 + 1.0 * (changed > 0.005) + 2.0 * (changed > 0.2)
@@ -124,9 +139,10 @@ def memory_shown(place: torch.Tensor, rows: torch.Tensor, over: torch.Tensor, ki
 
 class FlowFrames:
     """x-prediction with absolute and squared errors. Each frame is learned at t = 0, as a draft without noise, and later also at a
-    random t. Pictures are carried along by the true scroll. stress: the additional weight of pixels that change otherwise.
-    teacher: a trained network, whose predictions from the same inputs are learned as well, with the weight `teaching` of 0 to 1
-    against the recorded frames."""
+    random t. Pictures are carried along by the true scroll. Where pictures change as a whole, a critic, which sees the last two
+    frames, too, sharpens what is drawn at later t; the draft stays a mean. stress: the additional weight of pixels that change
+    otherwise. teacher: a trained network, whose predictions from the same inputs are learned as well, with the weight `teaching`
+    of 0 to 1 against the recorded frames."""
 
     def __init__(
         self,
@@ -146,6 +162,9 @@ class FlowFrames:
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         rate = warmup_cosine(learning_rate, WARMUP // rollout, 0.02)
         self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
+        self.critic = PatchCritic(3 * FRAMES_JUDGED) if network.config.recalls else None
+        if self.critic is not None:
+            self.modules["critic"], self.learners["critic"] = self.critic, critic_learner(self.critic)
 
     def compile(self) -> None:
         """Has both halves of the network compiled at their first call, and drawing captured as a CUDA graph."""
@@ -169,13 +188,13 @@ class FlowFrames:
             scroll = None
             if self.generator.scrolling is not None:
                 scroll = scroll_index(shown[:, 0], truth, self.generator.moves)
-            yield self._loss(shown, context, memory, scroll, kept, truth, before, now)
+            yield from self._losses(shown, context, memory, scroll, kept, truth, before, now)
             count = half if step + 1 < recorded.shape[1] else 0
             drawn = self._drawn(shown[:count], context, scroll, memory, kept, now) if count else truth[:0]
             shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
 
-    def _loss(self, shown, context, memory, scroll, kept, truth, before, now: TrainStep) -> Loss:
-        """The loss of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
+    def _losses(self, shown, context, memory, scroll, kept, truth, before, now: TrainStep) -> Iterator[Loss]:
+        """The losses of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
         batch, network = len(truth), self.generator
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
         base, was = frames[:, 0], before.float() / 127.5 - 1
@@ -192,7 +211,8 @@ class FlowFrames:
         parts = {"draft": self._error(draft, target, base, changes)}
         samples = now.share >= DRAFTS
         if not samples and kept is None:
-            return Loss("generator", parts["draft"], parts)
+            yield Loss("generator", parts["draft"], parts)
+            return
         t = LATEST * now.rand(batch)
         if kept is not None:  # at later times x_t shows more than memory does
             seen = network.recalling(seen, kept[0], kept[1], draft.detach())
@@ -203,7 +223,29 @@ class FlowFrames:
         with now.half():
             drawn = self._clean(seen, noisy, t)
         parts["drawn"] = self._error(drawn, self._target(clean, taught, noisy, t, now), base, changes)
-        return Loss("generator", parts["draft"] + parts["drawn"], parts)
+        loss = parts["draft"] + parts["drawn"]
+        if self.critic is None or not samples:
+            yield Loss("generator", loss, parts)
+            return
+        last = seen.base, seen.base - seen.older
+        pull = self._pull(self.critic, drawn.detach(), last, t > 0, now)
+        yield Loss("generator", loss + scaled_pull(drawn, loss, pull, CRITIC_WEIGHT), parts)
+        hinge = self._hinge(self.critic, clean, drawn.detach(), last, t > 0, now)
+        yield Loss("critic", hinge, {"critic": hinge})
+
+    def _pull(self, critic: PatchCritic, drawn, last, sampled, now: TrainStep) -> torch.Tensor:
+        """The gradient by the frames `drawn` [B, 3, H, W] by which those that are `sampled` (bool [B]) look less recorded."""
+        drawn = drawn.requires_grad_()
+        with now.half():
+            realness = critic(_after(drawn, last)).float()
+        (pull,) = torch.autograd.grad(-_mean_of(realness, sampled), drawn)
+        return pull
+
+    def _hinge(self, critic: PatchCritic, clean, drawn, last, sampled, now: TrainStep) -> torch.Tensor:
+        """The critic's loss of the recorded frames `clean` and of those that are `sampled` of the frames `drawn`."""
+        with now.half():
+            recorded, generated = (critic(_after(frames, last)).float() for frames in (clean, drawn))
+        return F.relu(1 - recorded).mean() + _mean_of(F.relu(1 + generated), sampled)
 
     @torch.no_grad()
     def _taught(self, frames, context, scroll, memory, noise, now: TrainStep) -> FlowFeatures | None:

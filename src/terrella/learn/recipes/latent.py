@@ -170,9 +170,9 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
 
 
 def _has_ends(recording: Recording) -> bool:
-    """Whether an episode ended; a limit of steps is no end. Otherwise planners would find ends that the world makes up."""
+    """Whether an episode that training sees ended; a limit of steps is no end. Without one, ends would be made up."""
     done = recording.cache.done
-    return done is not None and bool(np.any(done))
+    return done is not None and bool(np.asarray(done)[recording.usable].any())
 
 
 class _Training:
