@@ -21,7 +21,8 @@ from terrella.core import Spec
 from terrella.core.errors import ObservationError, TerrellaError
 from terrella.data import Dataset
 from terrella.sim.randomised import Randomised
-from terrella.workflows.opening import EnvironmentConfig
+from terrella.workflows.collect import open_player
+from terrella.workflows.opening import ControlsConfig, EnvironmentConfig
 from terrella.workflows.plan_energy import DECISIONS
 from terrella.workflows.plan_study import PlanConfig, open_study
 from terrella.workflows.progress import silent
@@ -311,3 +312,8 @@ def test_what_is_planned_in_a_learned_world_is_recorded_in_the_environment(capsy
     assert Dataset(more).episode(0)["rgb"].shape[1:] == (16, 32, 3)  # as the world sees them
     assert main(["record", "world", "gym:CartPole-v1", *words]) == 2
     assert "differ" in capsys.readouterr().err
+
+
+def test_no_pictures_are_drawn_where_none_are_recorded():
+    world, _ = open_player("mujoco:arm", ControlsConfig(), EnvironmentConfig(), False, "plan", "mujoco:arm")
+    assert "rgb" not in world.spec.channels

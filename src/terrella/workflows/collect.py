@@ -153,7 +153,8 @@ def open_player(
         world = controls.of(environment.open(name, rgb=rgb))
         return world, lambda: policy_of(policy, world.spec, world)
     learned = load_named(inside, "cpu")
-    world = controls.of(open_real(name, environment, learned.spec, rgb))
+    opened = open_real(name, environment, learned.spec) if rgb else environment.open(name, rgb=False)
+    world = controls.of(opened)
     check_alike(learned.spec, world.spec)
     return world, lambda: policy_of(policy, world.spec, learned)
 
