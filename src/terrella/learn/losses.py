@@ -16,7 +16,7 @@ class PatchCritic(nn.Module):
     """Classifies 16-pixel patches as recorded or generated (hinge loss), by maps [B, inputs, H, W] of a frame and of what is known
     of it."""
 
-    def __init__(self, inputs: int):
+    def __init__(self, inputs: int = GLIMPSED):
         super().__init__()
         widths = (inputs, 32, 48, 64)
         self.layers = nn.ModuleList(

@@ -11,16 +11,7 @@ from ...core.precision import half_precision
 from ...worlds.generator import Conditioning, UNet
 from ..batches import Batch, generate_now
 from ..learners import Ema, Learner, adamw
-from ..losses import (
-    GLIMPSED,
-    PatchCritic,
-    critic_learner,
-    critic_loss,
-    critic_pull,
-    flow_losses,
-    truth_losses,
-    weighted_total,
-)
+from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, truth_losses, weighted_total
 from ..train_step import TrainStep
 from ..trainer import Loss
 
@@ -89,7 +80,7 @@ class Student:
     ):
         self.name, self.flow_steps, self.weights = name, flow_steps, weights
         self.generator = copy.deepcopy(generator).train().requires_grad_(True)
-        self.smooth, self.critic = Ema(self.generator, 0.995), PatchCritic(GLIMPSED)
+        self.smooth, self.critic = Ema(self.generator, 0.995), PatchCritic()
         self.matching = None if teacher is None else Matching(teacher)
         self.modules = {name: self.generator, "smooth": self.smooth, "critic": self.critic}
         generating = adamw((self.generator,), rate, betas=(momentum, 0.99), average=self.smooth)

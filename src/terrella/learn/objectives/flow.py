@@ -8,16 +8,7 @@ import torch
 from ...worlds.generator import Conditioning, UNet, channels_last
 from ..batches import Batch, generate_now
 from ..learners import Ema, adamw, warmup_cosine
-from ..losses import (
-    GLIMPSED,
-    PatchCritic,
-    critic_learner,
-    critic_loss,
-    critic_pull,
-    flow_losses,
-    frame_losses,
-    weighted_total,
-)
+from ..losses import PatchCritic, critic_learner, critic_loss, critic_pull, flow_losses, frame_losses, weighted_total
 from ..train_step import TrainStep
 from ..trainer import Loss
 
@@ -31,7 +22,7 @@ class Flow:
     losses_per_batch = 1  # gradient steps of the generator per batch
 
     def __init__(self, generator: UNet, flow_steps: int, learning_rate: float, critic_from: int, critic_weight: float):
-        self.generator, self.critic = channels_last(generator), PatchCritic(GLIMPSED)
+        self.generator, self.critic = channels_last(generator), PatchCritic()
         self.one_step, self.critic_from, self.critic_weight = flow_steps == 1, critic_from, critic_weight
         self.smooth = Ema(self.generator, 0.999)
         self.modules = {"generator": self.generator, "smooth": self.smooth, "critic": self.critic}
