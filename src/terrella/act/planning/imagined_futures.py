@@ -31,16 +31,15 @@ def imagined_futures(
     pictures: list[torch.Tensor] = []
     times = np.linspace(0, plans.shape[1], count).round().astype(int).tolist()
     rng, state = make_rng(memory.seed), decision.state.fork(len(plans))
-    ends = cost.until_done and "done" in world.spec.channels
-    read = [*cost.channels, *(["done"] if ends else [])]
+    read = [*cost.channels, *cost.ends(world.spec)]
     for step in range(plans.shape[1] + 1):
         if step:
             with torch.no_grad():
                 state = world.imagine(state, plans[:, step - 1].to(state.device), rng)
                 seen = {name: value[None] for name, value in world.render(state, read).items()}
                 price = cost.step_cost(seen, decision.goal).cpu()
-                price = price if alive is None else torch.where(alive, price, 0.0)
-                alive = ~seen["done"].cpu() & (True if alive is None else alive) if ends else None
+                price = price if alive is None else torch.where(alive > 0, alive * price, 0.0)
+                alive = cost.survival(seen, alive)
                 total = cost.accumulate(total, price)
                 if state.deferred is not None:  # render step by step, not all at the end
                     state.deferred.values()

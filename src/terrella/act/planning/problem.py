@@ -77,9 +77,9 @@ class PlanningProblem:
     def __post_init__(self):
         self.trusted_moves = torch.full((self.batch,), self.horizon)
         self.shortened = torch.zeros(self.batch, dtype=torch.bool)
-        done = ("done",) if self.cost.until_done and "done" in self.world.spec.channels else ()
+        ends = self.cost.ends(self.world.spec)
         uncertainty = (trust_channel(self.world.spec),) if self.trust is not None else ()
-        self._channels = tuple(dict.fromkeys((*self.cost.channels, *done, *uncertainty)))
+        self._channels = tuple(dict.fromkeys((*self.cost.channels, *ends, *uncertainty)))
         leap = self.world.spec.leap
         self._leaps = bool(leap) and self.block % leap == 0 and self.cost.over == "last" and self._channels == (LATENT,)
         self._count = 0
@@ -113,8 +113,8 @@ class PlanningProblem:
     def move(
         self, state: State, codes: torch.Tensor, alive: torch.Tensor | None, candidates: int
     ) -> tuple[State, torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """One move [B, N, D] of all candidates: the state, the move's cost [B, N], which of them have not ended [B, N], and the
-        share [B] within `trust`. `alive`: which had not ended before."""
+        """One move [B, N, D] of all candidates: the state, the move's cost [B, N], the probability [B, N] that they have not ended,
+        and the share [B] within `trust`. `alive`: that probability before the move."""
         actions = self.moves.actions(codes).flatten(0, 1).to(state.device)
         total = trusted = None
         if self._leaps:
@@ -129,10 +129,8 @@ class PlanningProblem:
             state = self._imagine(state, actions, candidates)
             seen = self._render(state, candidates)
             step = self.cost.step_cost(seen, self.goal).cpu()
-            if "done" in seen and self.cost.until_done:
-                step = step if alive is None else torch.where(alive, step, 0.0)
-                going = ~seen["done"].cpu()
-                alive = going if alive is None else alive & going
+            step = step if alive is None else torch.where(alive > 0, alive * step, 0.0)
+            alive = self.cost.survival(seen, alive)
             if self.trust is not None:
                 trusted = (seen[trust_channel(self.world.spec)].cpu() <= self.trust).float().mean(1)
             total = self.cost.accumulate(total, step)
