@@ -305,13 +305,17 @@ def test_planning_from_python(tmp_path):
 def test_what_is_planned_in_a_learned_world_is_recorded_in_the_environment(capsys, tmp_path):
     first, run, more = (str(tmp_path / name) for name in ("first", "run", "more"))
     assert main(["record", "world", NAME, "--policy", "random", "--frames", "400", "--out", first]) == 0
-    small = ["--steps", "2", "--latent", "4", "--hidden", "8", "--members", "1", "--rollout", "1"]
+    small = ["--steps", "2", "--latent", "4", "--hidden", "8", "--members", "2", "--rollout", "1"]
     assert main(["train", "latent", first, "--out", run, *small]) == 0
     words = ["--in", run, "--policy", "plan:samples=2,iterations=1,horizon=1", "--out", more]
     assert main(["record", "world", NAME, "--frames", "20", *words]) == 0
     assert Dataset(more).episode(0)["rgb"].shape[1:] == (16, 32, 3)  # as the world sees them
     assert main(["record", "world", "gym:CartPole-v1", *words]) == 2
     assert "differ" in capsys.readouterr().err
+    quick = [*QUICK[:-1], "--episodes", "1", "--no-curve", "--out", str(tmp_path / "plan")]
+    for limit, cut in (("1e-9", True), ("1e9", False)):
+        assert main(["plan", run, "--real", NAME, "--trust", limit, *quick]) == 0
+        assert ("plans were cut to 1.0 of 4 moves on average" in capsys.readouterr().out) == cut
 
 
 def test_no_pictures_are_drawn_where_none_are_recorded():

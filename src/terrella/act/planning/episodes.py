@@ -66,6 +66,7 @@ class PlayedEpisode:
     actions: list[torch.Tensor] = field(default_factory=list)  # [*action.shape] each step
     ms: list[float] = field(default_factory=list)  # of each decision
     imagined: list[int] = field(default_factory=list)  # steps imagined for each decision
+    trusted: list[int] = field(default_factory=list)  # moves of each decision's plans that are within `trust`
     best_cost: float = torch.inf  # of all plans
     decision: Decision | None = None  # the last
     seen: list[dict[str, torch.Tensor]] = field(default_factory=list)  # kept channels at the start and after each step
@@ -245,6 +246,7 @@ def _add_action(episode: PlayedEpisode, action: torch.Tensor, ms: float, memory:
         episode.best_cost = min(episode.best_cost, planned.decision.cost)
         episode.ms.append(planned.decision.ms)
         episode.imagined.append(planned.decision.steps)
+        episode.trusted.append(planned.decision.trusted_moves)
 
 
 def _memory_at(memory: Any, rows: torch.Tensor) -> Any:
