@@ -7,10 +7,12 @@ import json
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from tests.learn.test_imitation import NAME, teacher
 
 import terrella
+from terrella.act.imitation_network import REACH, SHIFTS, displacements
 from terrella.act.policies_by_name import NoisyPolicy
 from terrella.cli import main
 from terrella.core.policy import Random, Reactive
@@ -156,3 +158,51 @@ def test_labels_of_axes_are_near_the_truth(tmp_path):
     )
     valid = np.asarray(before.action_valid)
     assert np.abs(after.action[valid] - before.action[valid]).mean() < 0.5 and np.abs(after.action).max() <= 2.0
+
+
+class Turning(gymnasium.Env):
+    """A camera that turns to the left, not, or to the right, before a wall that differs in every episode."""
+
+    action_space = spaces.Discrete(3)
+    observation_space = spaces.Box(0, 255, (16, 24, 3), np.uint8)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    render_mode = "rgb_array"
+
+    def __init__(self, render_mode: str = "rgb_array"):
+        pass
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.wall = self.np_random.integers(0, 255, (4, 25, 3), np.uint8).repeat(4, 0).repeat(4, 1)
+        self.at = self.steps = 0
+        return self.render(), {}
+
+    def render(self):
+        return np.roll(self.wall, self.at, 1)[:, :24]
+
+    def step(self, action):
+        self.at, self.steps = self.at + 3 * (int(action) - 1), self.steps + 1
+        return self.render(), 0.0, False, self.steps >= 20, {}
+
+
+def test_turns_are_named_from_a_hundred_labels(tmp_path):
+    world = GymnasiumWorld(Turning)
+    record(world, Random(world.spec), tmp_path / "recording", 400, make_rng(0))
+    training = InverseTraining(picture_size=(16, 24), steps=50, batch=32, hidden=32, learning_rate=3e-3)
+    result = train_inverse(tmp_path / "recording", InverseConfig(tmp_path / "run", training, labelled=0.2))
+    assert result.facts["true_accuracy"] > 0.8
+
+
+@pytest.mark.parametrize("size", [(16, 24), (32, 48)])
+def test_a_displacement_is_seen_as_what_it_is(size):
+    factor = size[0] // 16  # of what is looked at
+    noise = torch.rand(1, 3, 16 + 8, 24 + 20, generator=make_rng(0))
+    wall = noise.repeat_interleave(factor, 2).repeat_interleave(factor, 3)
+    for down, across in ((0, 0), (2, -5), (-1, 7)):
+        before, after = (
+            wall[..., (4 + y) * factor :, (10 + x) * factor :][..., : size[0], : size[1]]
+            for y, x in ((0, 0), (down, across))
+        )
+        shifts = displacements(after, before)
+        likeliest = [SHIFTS[each] for each in shifts.argmax(1).flatten().tolist()]
+        assert likeliest.count((REACH[0] + down, REACH[1] + across)) >= 12  # of 16 parts; others lie at the edge

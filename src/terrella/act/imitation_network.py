@@ -22,6 +22,10 @@ CODES = 32  # values of a code
 CELLS = 4  # side of the pooled feature map of a picture
 QUERIES = 4  # places of a picture to which an instruction attends, for each of its waypoints
 SHARPNESS = 20.0  # of attention: factor on the cosines of queries and places; plain products never learned to tell colours apart
+COARSE = 40  # pixels of the longer side, at most, of pictures in which displacements are looked for
+REACH = (3, 8)  # of these pixels, down and across, by which a part may have moved since the picture before
+SHIFTS = tuple((down, across) for down in range(2 * REACH[0] + 1) for across in range(2 * REACH[1] + 1))
+CONTRAST = 0.1  # of how well displacements fit, as a share of the mean error
 FLOW_STEPS = 8  # Euler steps from noise to a chunk
 
 
@@ -38,7 +42,9 @@ class ImitationConfig:
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
     waypoint: int = 0  # steps after an instruction began for which it predicts its numbers, and at its end; 0: not
-    differences: bool = False  # whether it sees by how much numbers changed since the observation before, too
+    differences: bool = (
+        False  # whether it sees by how much numbers and pictures changed since the observation before, too
+    )
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
     )
@@ -101,16 +107,20 @@ class ImitationConfig:
 class _Look(nn.Module):
     """A picture or a grid of codes [N, H, W, C] to features [N, width], modulated by the instruction (FiLM, Perez et al. 2018). Of
     a picture also where each map is largest, and in columns of their own [N, 2 * queries] where the instruction's queries attend
-    to, by cosines: x of each, then y."""
+    to, by cosines: x of each, then y. steps: of this many pictures, one after another, each is seen with its change from the one
+    before (of codes with those before), so that convolutions see what moves; 0: alone."""
 
     offset: torch.Tensor
 
-    def __init__(self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: WordEncoder | None):
+    def __init__(
+        self, shape: tuple[int, ...], size: tuple[int, int], width: int, words: WordEncoder | None, steps: int = 0
+    ):
         super().__init__()
-        self.picture, self.size = is_picture(shape), size
-        channels = shape[2]
+        self.picture, self.size, self.steps = is_picture(shape), size, steps
+        channels = shape[2] * (2 if steps else 1)
         if self.picture:
             last, cells = 48, CELLS**2 + 2
+            self.moves = nn.Linear(len(SHIFTS) * CELLS**2, width) if steps else None
             self.first = nn.Sequential(
                 nn.Conv2d(channels, 24, 4, 2, 1), nn.ReLU(), nn.Conv2d(24, last, 4, 2, 1), nn.ReLU()
             )
@@ -129,9 +139,12 @@ class _Look(nn.Module):
     def forward(self, seen: torch.Tensor, words: torch.Tensor | None) -> torch.Tensor:
         if self.picture:
             unit = seen.permute(0, 3, 1, 2).float() / (255 if seen.dtype == torch.uint8 else 1) - 0.5
-            features = self.first(unit if unit.shape[2:] == self.size else F.interpolate(unit, self.size, mode="area"))
+            unit = unit if unit.shape[2:] == self.size else F.interpolate(unit, self.size, mode="area")
+            before = self._before(unit) if self.steps else unit
+            features = self.first(torch.cat([unit, unit - before], 1) if self.steps else unit)
         else:
-            codes = seen.long().clamp(0, CODES - 1) + self.offset
+            codes = seen.long().clamp(0, CODES - 1)
+            codes = (torch.cat([codes, self._before(codes)], 3) if self.steps else codes) + self.offset
             features = self.first(self.codes(codes).sum(3).permute(0, 3, 1, 2))
         plain = features
         if self.film is not None and words is not None:
@@ -141,13 +154,32 @@ class _Look(nn.Module):
         if not self.picture:
             return torch.relu(self.out(features.flatten(1)))
         pooled = torch.cat([F.adaptive_avg_pool2d(features, CELLS).flatten(1), spatial_softmax(features)], 1)
-        parts = [torch.relu(self.out(pooled))]
+        out = self.out(pooled)
+        parts = [torch.relu(out if self.moves is None else out + self.moves(displacements(unit, before).flatten(1)))]
         if self.keys is not None and self.queries is not None and words is not None:
             picks = words.unflatten(1, (-1, self.queries.in_features))[:, 1:]
             queries = SHARPNESS * F.normalize(self.queries(picks), dim=2)
             keys = F.normalize(self.keys(plain), dim=1)
             parts.append(spatial_softmax(torch.einsum("nqc,nchw->nqhw", queries, keys)))
         return torch.cat(parts, 1)
+
+    def _before(self, seen: torch.Tensor) -> torch.Tensor:
+        """What was seen a step before each of [N * steps, ...]; before the first the first itself."""
+        steps = seen.unflatten(0, (-1, self.steps))
+        return torch.cat([steps[:, :1], steps[:, :-1]], 1).flatten(0, 1)
+
+
+def displacements(after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    """Where each of CELLS x CELLS parts of pictures [N, C, H, W] came from in those before: a softmax of how well each of SHIFTS
+    fits, [N, SHIFTS, CELLS, CELLS] (a correlation layer, as in FlowNet, Dosovitskiy et al. 2015)."""
+    coarse = -(-max(after.shape[2:]) // COARSE)
+    grey, earlier = (F.avg_pool2d(one.mean(1, keepdim=True), coarse) for one in (after, before))
+    (height, width), (down, across) = grey.shape[2:], REACH
+    earlier = F.pad(earlier, (across, across, down, down), mode="replicate")
+    moved = (earlier[..., y : y + height, x : x + width] for y, x in SHIFTS)  # one at a time, so that caches hold it
+    errors = torch.cat([F.adaptive_avg_pool2d((grey - one).abs_(), CELLS) for one in moved], 1)
+    best, usual = errors.amin(1, keepdim=True), errors.mean(1, keepdim=True)
+    return torch.softmax((best - errors) / (CONTRAST * usual + 1e-3), 1)
 
 
 def spatial_softmax(features: torch.Tensor) -> torch.Tensor:
@@ -198,7 +230,10 @@ class ImitationNetwork(nn.Module):
         if config.differences:
             self.register_buffer("change", torch.ones(width))
             changes = (config.window - 1) * width
-        self.looks = nn.ModuleList(_Look(shape, config.size, actor.hidden, self.words) for _, shape in self._arrays)
+        steps = config.window if config.differences else 0
+        self.looks = nn.ModuleList(
+            _Look(shape, config.size, actor.hidden, self.words, steps) for _, shape in self._arrays
+        )
         self.attended = 2 * picks * pictures if words else 0
         self.width = width + len(config.bodies) + actor.hidden * len(self.looks) + self.attended
         foresees = config.waypoints if width and self.attended else 0
