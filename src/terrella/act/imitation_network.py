@@ -176,9 +176,8 @@ def displacements(after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
     grey, earlier = (F.avg_pool2d(one.mean(1, keepdim=True), coarse) for one in (after, before))
     (height, width), (down, across) = grey.shape[2:], REACH
     earlier = F.pad(earlier, (across, across, down, down), mode="replicate")
-    displaced = (
-        earlier[..., y : y + height, x : x + width] for y, x in SHIFTS
-    )  # one at a time, so that caches hold it
+    # One at a time, so that the processor's caches hold it.
+    displaced = (earlier[..., y : y + height, x : x + width] for y, x in SHIFTS)
     errors = torch.cat([F.adaptive_avg_pool2d((grey - one).abs_(), CELLS) for one in displaced], 1)
     best, usual = errors.amin(1, keepdim=True), errors.mean(1, keepdim=True)
     return torch.softmax((best - errors) / (CONTRAST * usual + 1e-3), 1)
