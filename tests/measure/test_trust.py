@@ -95,6 +95,19 @@ def test_planners_and_practice_stop_there_and_say_so():
     assert len(said) == count
 
 
+def test_plans_in_a_latent_world_go_on_and_it_is_said():
+    said: list[str] = []
+    world = Fading(card={**CARD, "trust_steps_measured": 12})
+    world.spec = replace(world.spec, channels={**world.spec.channels, "latent": spaces.Box(-1, 1, (2,))})
+    search = SearchConfig().filled(horizon=400)
+    assert search_within_trust(world, search, said.append) == search == within_measured_trust(world, search)
+    assert "not trusted beyond 12 of 400 steps" in said[0] and "Its plans go on; --trust cuts them" in said[0]
+    policy = policy_of("plan:horizon=40", world.spec, world)
+    assert isinstance(policy, Planner) and policy.config.horizon == 40 and policy.config.trust is None
+    practice = practice_within_trust(world, Practice(horizon=40), said.append)
+    assert practice.horizon == 12 and "rollouts end there" in said[1]  # a critic's value stands for what follows
+
+
 def test_a_planner_by_its_name_stops_there_too():
     card = {"uncertainty": {"ceiling": 0.4, "invents": 0.3}, "trust_steps_measured": 12}
     said: list[str] = []

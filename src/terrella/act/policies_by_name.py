@@ -16,7 +16,7 @@ import torch
 from ..core.errors import ActionError, TerrellaError
 from ..core.policy import Constant, Idle, Policy, Random, Reactive, observed_channels
 from ..core.similar import did_you_mean
-from ..core.spec import AXES, BUTTONS, Spec, shape_of
+from ..core.spec import AXES, BUTTONS, Spec, cuts_plans, shape_of
 from ..core.world import Observation, World
 from .belief import load_learned_policy
 from .driver import driver_of
@@ -152,7 +152,8 @@ def _planner(name: str, text: str, world: World | None, cost: Cost | None, withi
     if given.get("search", "icem") not in get_args(Kind):
         raise TerrellaError(f"'{name}': there is no search '{given['search']}'; there are {', '.join(get_args(Kind))}.")
     levels = world.spec.card.get("uncertainty")
-    trust = levels.get("invents") if isinstance(levels, dict) and "uncertainty" in world.spec.channels else None
+    declares = "uncertainty" in world.spec.channels and cuts_plans(world.spec)
+    trust = levels.get("invents") if isinstance(levels, dict) and declares else None
     cost = negative_reward(world.spec) if cost is None else cost
     search = within(world, SearchConfig(**given).filled())
     return Planner(world, cost, replace(search, trust=trust if search.trust is None else search.trust))

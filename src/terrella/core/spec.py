@@ -213,6 +213,12 @@ def trust_channel(spec: Spec) -> str:
     return "invented" if "invented" in spec.channels else "uncertainty"
 
 
+def cuts_plans(spec: Spec) -> bool:
+    """Whether plans end, unless a limit is given, where the world is not trusted. Not in latent worlds: no value stands for what
+    lies beyond, and a plan too short for the task did worse there than one that errs (docs/lab/planning.md)."""
+    return "latent" not in spec.channels
+
+
 def chance_error(spec: Spec) -> float:
     """The error of a random observation of the world, in the unit of its `uncertainty`: for pictures by its card, for latents the
     square root of 2. NaN where the world has no `uncertainty`, or does not say."""

@@ -29,7 +29,7 @@ from ..act.planning.routes import NoRoute
 from ..act.policies_by_name import policy_of, proposal_policy
 from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, Random
-from ..core.spec import Spec
+from ..core.spec import Spec, cuts_plans
 from ..core.world import World
 from ..serve.picture import uncertainty_levels
 from .compute_curve import CurvePoint, compute_of, figures_of, halved
@@ -201,10 +201,10 @@ def cost_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfig) 
 
 def planner_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfig, search: SearchConfig) -> Planner:
     """A planner to the goal. Its plans end where the world invents, if `trust` is not set and the world renders uncertainty after
-    each step: a world that leaps over a block does not."""
+    each step: a world that leaps over a block does not. In a latent world they end at a `trust` that is set alone."""
     spec = world.spec
     leaps = bool(spec.leap) and search.block % spec.leap == 0 and config.cost == "last"
-    if search.trust is None and not leaps and isinstance(spec.card.get("uncertainty"), dict):
+    if search.trust is None and not leaps and cuts_plans(spec) and isinstance(spec.card.get("uncertainty"), dict):
         if levels := uncertainty_levels(spec):
             search = replace(search, trust=levels[1])
     proposal = None if config.proposal is None else proposal_policy(config.proposal, world)

@@ -11,7 +11,7 @@ import torch
 
 from ...core import chance
 from ...core.errors import PlanningError
-from ...core.spec import measured_trust
+from ...core.spec import cuts_plans, measured_trust
 from ...core.state import State
 from ...core.world import World
 from .moves import ContinuousMoves, coloured
@@ -44,7 +44,7 @@ class SearchConfig:
     budget_ms: float | None = None
     # A plan is cut short at the step where half of the candidates exceed this value of the world's channel `invented`, or of
     # `uncertainty` where it has no such channel. Without it, `terrella plan` and the policy `plan` use the threshold that the world
-    # declares, if any.
+    # declares, if any; in a latent world they cut no plan.
     trust: float | None = None
     elites: int = 0
     """Best candidates of a round, to which the sampling distribution is fitted. 0 means an eighth of the samples."""
@@ -87,8 +87,8 @@ class SearchConfig:
 
 def within_measured_trust(world: World, search: SearchConfig) -> SearchConfig:
     """The search, without zeros, with plans no longer than the measured trust horizon of the world's card; as it is where there
-    is none, or `trust` is set."""
-    steps = measured_trust(world.spec)
+    is none, in a latent world, or where `trust` is set."""
+    steps = measured_trust(world.spec) if cuts_plans(world.spec) else None
     return search if steps is None or search.trust is not None else search.within(steps)
 
 
