@@ -316,6 +316,9 @@ def test_what_is_planned_in_a_learned_world_is_recorded_in_the_environment(capsy
     for limit, cut in (("1e-9", True), ("1e9", False)):
         assert main(["plan", run, "--real", NAME, "--trust", limit, *quick]) == 0
         assert ("plans were cut to 1.0 of 4 moves on average" in capsys.readouterr().out) == cut
+    agent = ["--agent", "plan:horizon=2,samples=2,iterations=1", "--episodes", "1", "--steps", "4", "--no-curve"]
+    assert main(["plan", NAME, *agent, "--out", str(tmp_path / "agent")]) == 0
+    assert "plans were cut" not in capsys.readouterr().out, "shorter than the default, but whole"
 
 
 def test_no_pictures_are_drawn_where_none_are_recorded():

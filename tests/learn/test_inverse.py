@@ -15,6 +15,7 @@ import terrella
 from terrella.act.imitation_network import REACH, SHIFTS, displacements
 from terrella.act.policies_by_name import NoisyPolicy
 from terrella.cli import main
+from terrella.core.errors import CheckpointError
 from terrella.core.policy import Random, Reactive
 from terrella.core.world import make_rng
 from terrella.data import ClipCache, Dataset, record
@@ -191,6 +192,8 @@ def test_turns_are_named_from_a_hundred_labels(tmp_path):
     training = InverseTraining(picture_size=(16, 24), steps=50, batch=32, hidden=32, learning_rate=3e-3)
     result = train_inverse(tmp_path / "recording", InverseConfig(tmp_path / "run", training, labelled=0.2))
     assert result.facts["true_accuracy"] > 0.8
+    with pytest.raises(CheckpointError, match="does not act"):
+        terrella.load_policy(tmp_path / "run" / "inverse", world.spec)
 
 
 @pytest.mark.parametrize("size", [(16, 24), (32, 48)])
@@ -206,3 +209,9 @@ def test_a_displacement_is_seen_as_what_it_is(size):
         shifts = displacements(after, before)
         likeliest = [SHIFTS[each] for each in shifts.argmax(1).flatten().tolist()]
         assert likeliest.count((REACH[0] + down, REACH[1] + across)) >= 12  # of 16 parts; others lie at the edge
+
+
+def test_pictures_of_any_size_have_displacements():
+    for size in ((1, 1), (5, 7), (2, 100), (20, 2000)):
+        one = torch.rand(1, 3, *size, generator=make_rng(0))
+        assert bool(displacements(one, one).isfinite().all())

@@ -101,7 +101,7 @@ def test_plans_in_a_latent_world_go_on_and_it_is_said():
     world.spec = replace(world.spec, channels={**world.spec.channels, "latent": spaces.Box(-1, 1, (2,))})
     search = SearchConfig().filled(horizon=400)
     assert search_within_trust(world, search, said.append) == search == within_measured_trust(world, search)
-    assert "not trusted beyond 12 of 400 steps" in said[0] and "Its plans go on; --trust cuts them" in said[0]
+    assert "not trusted beyond 12 of 400 steps" in said[0] and "Its plans go on; --trust" in said[0]
     policy = policy_of("plan:horizon=40", world.spec, world)
     assert isinstance(policy, Planner) and policy.config.horizon == 40 and policy.config.trust is None
     practice = practice_within_trust(world, Practice(horizon=40), said.append)

@@ -14,6 +14,7 @@ from .actor import Actor
 from .imitation import ImitationActor
 from .lerobot_policy import kind_of_policy
 from .planning import SuccessCriterion
+from .planning.costs import ENDS, survival_after
 
 HORIZON, REPLAN = 24, 4  # steps of a plan, and of these executed before the next
 _LEFT, _QUEUE, _POLICY = "best.left", "best.queue", "best.policy."
@@ -79,7 +80,7 @@ class BestOf:
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor]]:
         """Of `count` plans: scores [B, count], first actions [B, count, REPLAN, ...], and the policy's memory after them."""
         world, criterion, batch = self.world, self.criterion, state.batch * count
-        outcome = [name for name in ("reward", "done") if name in world.spec.channels]
+        outcome = [name for name in ("reward", *ENDS) if name in world.spec.channels]
         channels = tuple(dict.fromkeys((*self._shown, *criterion.channels, *outcome)))
         ahead, memory, taken, kept = (
             state.fork(count),
@@ -92,6 +93,7 @@ class BestOf:
             torch.full((batch,), -torch.inf if criterion.defined else 0.0),
             torch.ones(batch, dtype=torch.bool),
         )
+        alive = torch.ones(batch)  # the probability that the episode goes on
         for step in range(HORIZON):
             action, memory = act(policy, seen, memory, batch, world.spec, rng)
             if step < REPLAN:
@@ -99,19 +101,21 @@ class BestOf:
                 kept = _tensors_of(memory)
             ahead = world.imagine(ahead, action.to(ahead.device), rng)
             seen = world.render(ahead, channels)
-            score = torch.where(going, self._score(score, seen, step), score)
+            score = torch.where(going, self._score(score, seen, step, alive), score)
             over = criterion.succeeded(world, seen).cpu() if criterion.defined else torch.zeros_like(going)
-            going = going & ~over & ~(seen["done"].cpu() if "done" in seen else torch.zeros_like(going))
+            left = survival_after(seen, alive)
+            alive = alive if left is None else left
+            going = going & ~over & (alive > 0)
         shape = state.batch, count
         memories = {name: value.unflatten(0, shape) for name, value in kept.items()}
         return score.view(shape), torch.stack(taken, 1).unflatten(0, shape), memories
 
-    def _score(self, score: torch.Tensor, seen: Observation, step: int) -> torch.Tensor:
-        """[N], after a step: success counts from 1 to 2, the sooner the more; else minus the least distance to the goal, or the
-        return so far."""
+    def _score(self, score: torch.Tensor, seen: Observation, step: int, alive: torch.Tensor) -> torch.Tensor:
+        """[N], after a step that is reached with probability `alive`: success counts from 1 to 2, the sooner the more; else minus
+        the least distance to the goal, or the expected return so far."""
         criterion = self.criterion
         if not criterion.defined:
-            return score + seen["reward"].cpu().float()
+            return score + alive * seen["reward"].cpu().float()
         away = criterion.distance(self.world, seen).nan_to_num(1.0)
         reached = criterion.succeeded(self.world, seen).cpu()
         return torch.where(reached, 2 - step / HORIZON, torch.maximum(score, -away))

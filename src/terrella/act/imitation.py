@@ -145,6 +145,8 @@ class ImitationActor:
         ActionError or ChannelError if `spec` has other actions or lacks a channel."""
 
         network, card = load_imitation_network(folder)
+        if network.config.differences:
+            raise CheckpointError(f"{folder} names the actions of clips (train inverse) and does not act.")
         return ImitationActor(network, spec, card)
 
 

@@ -173,7 +173,8 @@ def displacements(after: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
     """Where each of CELLS x CELLS parts of pictures [N, C, H, W] came from in those before: a softmax of how well each of SHIFTS
     fits, [N, SHIFTS, CELLS, CELLS] (a correlation layer, as in FlowNet, Dosovitskiy et al. 2015)."""
     coarse = -(-max(after.shape[2:]) // COARSE)
-    grey, earlier = (F.avg_pool2d(one.mean(1, keepdim=True), coarse) for one in (after, before))
+    pool = [min(coarse, side) for side in after.shape[2:]]
+    grey, earlier = (F.avg_pool2d(one.mean(1, keepdim=True), pool) for one in (after, before))
     (height, width), (down, across) = grey.shape[2:], REACH
     earlier = F.pad(earlier, (across, across, down, down), mode="replicate")
     # One at a time, so that the processor's caches hold it.

@@ -111,12 +111,13 @@ def _lines(
     if ms := planner.get("ms a decision"):
         imagined = f" for {planner['steps imagined'].value:,.0f} imagined steps" if "steps imagined" in planner else ""
         lines.append(f"a decision takes {ms.value:.0f} ms (95% within {ms.high:.0f}){imagined}")
-    moves, whole = [count for one in episodes for count in one.trusted], study.search.horizon
-    if min(moves, default=whole) < whole and not study.places:
-        mean = sum(moves) / len(moves)
+    moves = [count for one in episodes for count in one.trusted]
+    whole = max((one.decision.considered.shape[1] for one in episodes if one.decision), default=0)
+    if min(moves, default=whole) < whole:
+        mean, setting = sum(moves) / len(moves), "trust= of the policy" if study.config.agent else "--trust"
         lines.append(
             f"plans were cut to {mean:.1f} of {whole} moves on average, where the world's uncertainty passes its limit; "
-            "--trust sets the limit, and too short plans may be worse than uncertain ones"
+            f"{setting} sets the limit, and too short plans may be worse than uncertain ones"
         )
     lines += study.decision.lines() if study.decision else []
     if skipped := played.planner.skipped:

@@ -201,7 +201,7 @@ def cost_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfig) 
 
 def planner_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfig, search: SearchConfig) -> Planner:
     """A planner to the goal. Its plans end where the world invents, if `trust` is not set and the world renders uncertainty after
-    each step: a world that leaps over a block does not. In a latent world they end at a `trust` that is set alone."""
+    each step: a world that leaps over a block does not. In a latent world they end only if `trust` is set."""
     spec = world.spec
     leaps = bool(spec.leap) and search.block % spec.leap == 0 and config.cost == "last"
     if search.trust is None and not leaps and cuts_plans(spec) and isinstance(spec.card.get("uncertainty"), dict):
@@ -213,7 +213,7 @@ def planner_of(world: World, goal: Mapping[str, torch.Tensor], config: PlanConfi
 
 def walker(world: World, search: SearchConfig, goal: Destination) -> Policy:
     """A policy that walks to a place. Its plans are short: uncertainty, which takes drawing every frame, ends them only if `trust`
-    is set, else the world's measured trust horizon."""
+    is set, else the world's measured trust horizon, except in latent worlds."""
     search = within_measured_trust(world, search)
     return goal.navigator(Planner(world, goal.cost(world), search))
 

@@ -8,20 +8,17 @@ from ..core.spec import cuts_plans, measured_trust
 from ..core.world import World
 from ..learn.recipes.policy import Practice, settings_in
 from ..measure.trust import forecast_trust
-from .progress import Progress
+from .progress import Progress, silent
 
 
 def search_within_trust(world: World, search: SearchConfig, progress: Progress) -> SearchConfig:
     """The search, with a horizon of at most as many moves as the world can be trusted for; as it is where `trust` is set, in a
     latent world, and in one that expects no error. search: without zeros."""
-    if search.trust is not None:
-        return search
     cuts = cuts_plans(world.spec)
-    then = (
-        "Its plans end there; --trust sets another limit."
-        if cuts
-        else "Its plans go on; --trust cuts them at an uncertainty."
-    )
+    if search.trust is not None or (progress is silent and not cuts):
+        return search
+    setting = "--trust, or trust= of the policy `plan`,"
+    then = f"Its plans end there; {setting} sets another limit." if cuts else f"Its plans go on; {setting} cuts them."
     trusted = _trusted(world, search.horizon * search.block, then, progress)
     return search.within(trusted) if cuts else search
 

@@ -33,13 +33,13 @@ def search_config_within(
 
 
 def _step_ms(world: World, cost: Cost, state: State, samples: int) -> float:
-    """Milliseconds of the fastest of three steps of that many plans, with the channels of their cost."""
+    """Milliseconds of the fastest of three steps of that many plans, with the channels that a search renders."""
     rng, ahead, fastest = make_rng(0), state.fork(samples), float("inf")
     for _ in range(3):
         action = world.spec.sample_action(samples, rng).to(ahead.device)
         began = time.perf_counter()
         ahead = world.imagine(ahead, action, rng)
-        world.render(ahead, cost.channels)
+        world.render(ahead, (*cost.channels, *cost.ends(world.spec)))
         fastest = min(fastest, 1e3 * (time.perf_counter() - began))
     return max(fastest, 1e-3)
 

@@ -20,6 +20,17 @@ _TINY = 1e-12  # under a square root, for a finite gradient at 0
 ENDS = ("done", "done_probability")  # a world may have one of these channels, both or none
 
 
+def survival_after(seen: Observation, before: torch.Tensor | None) -> torch.Tensor | None:
+    """The probability [B, N] that episodes have not ended by a step, from that `before` it (None: 1); None where nothing ends them.
+    Ends of several steps accumulate, though `done` is set in none; where it is set, at a probability above one half, it is 0."""
+    going = None
+    if ENDS[0] in seen:
+        going = 1.0 - seen[ENDS[0]].cpu().float()
+    if ENDS[1] in seen:
+        going = (1.0 if going is None else going) * (1 - seen[ENDS[1]].cpu())
+    return going if going is None or before is None else going * before
+
+
 @dataclass(frozen=True)
 class Cost:
     """The cost of futures, from the channels that a world renders after each step."""
@@ -32,7 +43,8 @@ class Cost:
     goal: Mapping[str, torch.Tensor] = field(default_factory=dict)
     # "sum" of all steps, "last": the terminal cost of the papers, "least": the best moment of the horizon.
     over: Literal["sum", "last", "least"] = "sum"
-    # Whether steps after the end of the episode cost nothing, as rewards do, and each step as much as it is likely to be reached.
+    # Whether steps after the end of the episode cost nothing, as rewards do; each step is weighted by the probability that it is
+    # reached.
     until_done: bool = False
 
     def ends(self, spec: Spec) -> tuple[str, ...]:
@@ -40,14 +52,8 @@ class Cost:
         return tuple(name for name in ENDS if self.until_done and name in spec.channels)
 
     def survival(self, seen: Observation, before: torch.Tensor | None) -> torch.Tensor | None:
-        """The probability [B, N] that episodes have not ended by a step, from that `before` it (None: 1); None where nothing ends
-        them. Half an end in each of two steps is a whole one, though `done` is not set in either."""
-        going = None
-        if ENDS[0] in seen and self.until_done:
-            going = 1.0 - seen[ENDS[0]].cpu().float()
-        if ENDS[1] in seen and self.until_done:
-            going = (1.0 if going is None else going) * (1 - seen[ENDS[1]].cpu())
-        return going if going is None or before is None else going * before
+        """`survival_after`, where steps after the end cost nothing; else None."""
+        return survival_after(seen, before) if self.until_done else None
 
     def goal_of(self, entry: int, batch: int) -> dict[str, torch.Tensor]:
         """The goal [1, ...] of one of `batch` episodes; PlanningError if there are goals for another number of episodes."""
