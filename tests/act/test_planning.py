@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from tests.act.tiny_worlds import Broken, Grid, Point, Windy
+from tests.act.tiny_worlds import Broken, Grid, Perilous, Point, Windy
 
 from terrella.act.planning import (
     FullyObserved,
@@ -123,15 +123,7 @@ def test_a_plan_ends_where_the_world_no_longer_knows():
 
 
 def test_an_end_that_is_likely_though_never_certain_is_avoided():
-    class Perilous(Point):  # an episode left of the middle may end, and each step is as good as another
-        def shown(self, state, name):
-            where = state["at"][:, 0]
-            known = {"reward": torch.ones_like(where), "done_probability": 0.4 * torch.sigmoid(-3 * where)}
-            return known[name] if name in known else super().shown(state, name)
-
     world = Perilous()
-    unit = spaces.Box(0, 1, (), np.float32)
-    world.spec = replace(world.spec, channels={**world.spec.channels, "done_probability": unit})
     state = world.observe({"observation": torch.tensor([[-2.0, 0.0]])}, None, make_rng(0))
     policy = planner(world, "icem", negative_reward(world.spec), samples=48, iterations=4)
     seen = rollout(world, state, policy, make_rng(1), SEEN, 6).observations["observation"]

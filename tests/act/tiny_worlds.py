@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -64,6 +66,20 @@ class Windy(Point):
     """The same with chance."""
 
     wind = 0.3
+
+
+class Perilous(Point):
+    """An episode left of the middle may end at every step, and each step is as good as another."""
+
+    def __init__(self):
+        super().__init__()
+        unit = spaces.Box(0, 1, (), np.float32)
+        self.spec = replace(self.spec, channels={**self.spec.channels, "done_probability": unit})
+
+    def shown(self, state, name):
+        where = state["at"][:, 0]
+        known = {"reward": torch.ones_like(where), "done_probability": 0.4 * torch.sigmoid(-3 * where)}
+        return known[name] if name in known else super().shown(state, name)
 
 
 class Broken(Point):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tests.act.tiny_worlds import Grid, Point
+from tests.act.tiny_worlds import Grid, Perilous, Point
 
 from terrella.act.actor import Actor
 from terrella.act.actor_network import ActorConfig, ActorNetwork
@@ -198,3 +198,11 @@ def test_the_best_of_many_plans_succeeds_where_one_does_not():
     assert shares[16] > shares[1] + 0.3
     with pytest.raises(PlanningError, match="cannot imagine 0 plans"):
         BestOf(world, usual, drawing, 0, NEAR)
+
+
+def test_the_best_plan_avoids_ends_that_are_likely_though_never_certain():
+    world = Perilous()
+    state = {"observation": torch.zeros(8, 2)}
+    policy = BestOf(world, imitator(world, None), imitator(world, 1.0), 32, SuccessCriterion())
+    actions, _ = policy.act(state, policy.begin(8, make_rng(0)), make_rng(1))
+    assert float(actions[:, 0].mean()) > 0.1  # to the right, where episodes go on
