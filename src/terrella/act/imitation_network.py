@@ -42,9 +42,7 @@ class ImitationConfig:
     execute: int = 1  # of these, actions that it takes before it predicts anew
     outcome: float | None = None  # the standardised return that it asks for; None: not conditioned on outcomes
     waypoint: int = 0  # steps after an instruction began for which it predicts its numbers, and at its end; 0: not
-    differences: bool = (
-        False  # whether it sees by how much numbers and pictures changed since the observation before, too
-    )
+    differences: bool = False  # whether it sees changes of numbers and pictures since the observation before, too
     remember: int = (
         0  # steps of the windows on which it learns to carry a memory (a GRU); 0: it sees the last `history` ones
     )

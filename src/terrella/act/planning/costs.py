@@ -15,8 +15,6 @@ from ...core.world import Observation, World, make_rng
 LATENT = "latent"  # the channel in which a world compares pictures, if it has one
 _UNBOUNDED = 1e6  # a channel with a wider range counts as unbounded
 _TINY = 1e-12  # under a square root, for a finite gradient at 0
-
-
 ENDS = ("done", "done_probability")  # a world may have one of these channels, both or none
 
 
@@ -54,6 +52,10 @@ class Cost:
     def survival(self, seen: Observation, before: torch.Tensor | None) -> torch.Tensor | None:
         """`survival_after`, where steps after the end cost nothing; else None."""
         return survival_after(seen, before) if self.until_done else None
+
+    def expected(self, step: torch.Tensor, alive: torch.Tensor | None) -> torch.Tensor:
+        """The cost [B, N] of a step that is reached with probability `alive` [B, N] (None: 1)."""
+        return step if alive is None else torch.where(alive > 0, alive * step, 0.0)
 
     def goal_of(self, entry: int, batch: int) -> dict[str, torch.Tensor]:
         """The goal [1, ...] of one of `batch` episodes; PlanningError if there are goals for another number of episodes."""

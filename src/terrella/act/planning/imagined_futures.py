@@ -37,8 +37,7 @@ def imagined_futures(
             with torch.no_grad():
                 state = world.imagine(state, plans[:, step - 1].to(state.device), rng)
                 seen = {name: value[None] for name, value in world.render(state, read).items()}
-                price = cost.step_cost(seen, decision.goal).cpu()
-                price = price if alive is None else torch.where(alive > 0, alive * price, 0.0)
+                price = cost.expected(cost.step_cost(seen, decision.goal).cpu(), alive)
                 alive = cost.survival(seen, alive)
                 total = cost.accumulate(total, price)
                 if state.deferred is not None:  # render step by step, not all at the end

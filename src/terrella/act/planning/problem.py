@@ -128,8 +128,7 @@ class PlanningProblem:
         for _ in range(self.block):
             state = self._imagine(state, actions, candidates)
             seen = self._render(state, candidates)
-            step = self.cost.step_cost(seen, self.goal).cpu()
-            step = step if alive is None else torch.where(alive > 0, alive * step, 0.0)
+            step = self.cost.expected(self.cost.step_cost(seen, self.goal).cpu(), alive)
             alive = self.cost.survival(seen, alive)
             if self.trust is not None:
                 trusted = (seen[trust_channel(self.world.spec)].cpu() <= self.trust).float().mean(1)
