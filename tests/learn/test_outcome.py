@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ from gymnasium import spaces
 from tests.learn.stopping import quiet
 
 from terrella.core import chance, check_world, make_rng
+from terrella.core.errors import DatasetError, ObservationError
+from terrella.core.state import State
 from terrella.data import ClipCache, Recorder
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
 from terrella.learn.recipes.video import TrainConfig, train_video
@@ -23,6 +26,7 @@ from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import UNet
 from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import FrameOutcome
+from terrella.worlds.parts import Evidence
 
 from ..data.layouts import layout_of
 
@@ -35,11 +39,16 @@ def picture(place: int) -> np.ndarray:
     return rgb
 
 
+def shown(place: int, lives: int) -> dict[str, np.ndarray]:
+    numbers = {"lives": np.array([lives], np.float32), "place": np.array([place, 2 * place], np.float32)}
+    return {"rgb": picture(place), **numbers}
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """Six places in a row: the rightmost pays 2 on arrival, the leftmost takes one of 3 lives, and the last life ends it."""
     folder, rng = tmp_path_factory.mktemp("outcome") / "set", np.random.default_rng(0)
-    layout = layout_of(15.0, ("action_0",), rgb=SIZE, vectors={"lives": 1}, world=FACTS)
+    layout = layout_of(15.0, ("action_0",), rgb=SIZE, vectors={"lives": 1, "place": 2}, world=FACTS)
     with Recorder(folder, layout) as recorder:
         for _ in range(24):
             place, lives = int(rng.integers(1, 5)), 3
@@ -48,12 +57,11 @@ def recording(tmp_path_factory):
                 went = min(max(place + (0, -1, 1)[action], 0), 5)
                 reward = 2.0 if went == 5 and place != 5 else 0.0
                 fell = went == 0 and place != 0
-                seen = {"rgb": picture(place), "lives": np.array([lives], np.float32)}
-                recorder.add(seen, np.array([action]), reward, lives - fell == 0)
+                recorder.add(shown(place, lives), np.array([action]), reward, lives - fell == 0)
                 place, lives = went, lives - fell
                 if lives == 0:
                     break
-            recorder.add({"rgb": picture(place), "lives": np.array([lives], np.float32)}, None, 0.0, False)
+            recorder.add(shown(place, lives), None, 0.0, False)
             recorder.end_episode()
     return folder
 
@@ -104,6 +112,25 @@ def test_levels_and_shares_are_those_of_the_recording(learned):
     assert torch.allclose(shares @ among, torch.tensor([-1.0, -0.25, 3.0, 4.0]))
     many = levels(np.random.default_rng(0).normal(size=5000))
     assert len(many) <= 33 and list(many) == sorted(set(many))
+
+
+def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
+    cache, seen, happened, _ = learned
+    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, ["place"])
+    assert both.names == ("lives", "place", "place") and happened.names == ("lives",)
+    assert np.array_equal(both.vitals[:, 2], 2 * both.vitals[:, 1]) and both.vitals[:, 1].max() == 5
+    config = both.config()
+    assert config.changes == ((-1.0, 0.0), (-1.0, 0.0, 1.0), (-2.0, 0.0, 2.0))
+    outcome = FrameOutcome(config)
+    assert outcome.channels().shows["place"].shape == (2,) and outcome.channels().shows["lives"].shape == ()
+    assert outcome.channels().may_observe == ("lives", "place")
+    begun = Evidence(3, torch.device("cpu"), {})
+    place = torch.tensor([[1.0, 2.0], [3.0, 6.0], [0.0, 0.0]])
+    state = State(outcome.observe(None, begun, {"place": place}))
+    assert torch.equal(outcome.render(state, ("place",))["place"], place)
+    assert torch.equal(outcome.render(state, ("lives",))["lives"], torch.zeros(3))
+    with pytest.raises(ObservationError, match=re.escape("place is finite float [3, 2]; got (3,)")):
+        outcome.observe(None, begun, {"place": place[:, 0]})
 
 
 def test_a_vital_that_changes_at_ends_alone_has_its_size_after_them(learned):
@@ -172,15 +199,29 @@ def test_reward_end_and_lives_are_read_off_episodes_that_it_never_saw(learned):
 @pytest.mark.slow
 def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_path):
     config = TrainConfig(
-        size=SIZE, steps=4, batch=2, outcome_steps=8, uncertainty_frames=0, strip_every_s=1e9, channels=(8, 8, 8)
+        size=SIZE,
+        steps=4,
+        batch=2,
+        outcome_steps=8,
+        uncertainty_frames=0,
+        strip_every_s=1e9,
+        channels=(8, 8, 8),
+        predict=("place",),
     )
     train_video(recording, tmp_path, config, quiet)
     world = load_world(tmp_path / "world")
     assert world.spec.action == spaces.Discrete(3) and world.spec.action_names == ("STAY", "L", "R")
     assert {"reward", "done", "lives"} <= set(world.spec.channels)
     assert "states_can_be_saved" in check_world(world)
-    began = world.render(world.start(16, make_rng(0)), ("lives",))["lives"]
+    state = world.start(16, make_rng(0))
+    began, place = (world.render(state, (name,))[name] for name in ("lives", "place"))
+    assert place.shape == (16, 2) and torch.equal(place[:, 1], 2 * place[:, 0]) and len(set(place[:, 0].tolist())) > 1
     assert set(began.tolist()) <= {1.0, 2.0, 3.0} and len(set(began.tolist())) > 1, "a story begins with its own lives"
+
+
+def test_a_vector_that_no_recording_has_is_refused(recording, tmp_path):
+    with pytest.raises(DatasetError, match="no vector hand; it has lives, place"):
+        train_video(recording, tmp_path, TrainConfig(size=SIZE, predict=("hand",)), quiet)
 
 
 def test_a_dream_pays_costs_lives_and_ends(learned):

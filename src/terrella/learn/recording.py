@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from ..core.errors import DatasetError
 from ..core.spec import Camera, Spec, kind_of
 from ..data import ClipCache, Dataset, split
+from ..data.channels import usually_seen
 from ..data.training.cache import array_for, episodes_with, further_cameras
 from ..space.camera import Intrinsics, relative_pose, yaw
 from ..space.floorplan import Box, horizon, sees_into
@@ -30,6 +31,10 @@ THINGS = "observation.things"  # the mask of what may move or vanish
 OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # the table of objects, and their segmentation
 FEWEST = 64  # rows that can be trained on
 MOST = 96 * 128  # pixels of a frame by default
+WIDEST = 512  # numbers of a channel at most, to be treated as a vector
+NO_VECTORS = frozenset(
+    "rgb depth reward done done_probability uncertainty known keyframes mosaic instruction latent".split()
+)  # kinds of channels that are not learned as vectors
 
 
 @dataclass(frozen=True)
@@ -283,6 +288,28 @@ def joined_cameras(dataset: Dataset, geometry: bool = True) -> tuple[str, ...]:
     turned = yaw(first) - yaw(first[:1])
     to_left = torch.atan2(turned.sin(), turned.cos())
     return tuple(names[at] for at in to_left.argsort(descending=True).tolist())
+
+
+def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
+    """(channel, width) of the vectors of a recording, such as state, pose and vitals: those usually seen, or those in `wanted`."""
+    cache, widths = recording.cache, {}
+    for channel, key in cache.keys.items():
+        array = cache.arrays.get(key)
+        if (
+            array is None
+            or kind_of(channel) in NO_VECTORS
+            or key in ("action", "action_valid", "task")
+            or array.ndim > 2
+        ):
+            continue
+        if (width := int(np.prod(array.shape[1:]))) <= WIDEST:
+            widths[channel] = width
+    if lacks := [name for name in wanted if name not in widths]:
+        raise DatasetError(
+            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(widths)) or 'none'}."
+        )
+    chosen = wanted or [name for name in widths if usually_seen(name)]
+    return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
 
 
 def learned_size(height: int, width: int, most: int = MOST) -> tuple[int, int]:

@@ -20,8 +20,6 @@ from ..core.spec import DONE, REWARD
 from ..core.state import State
 from .parts import CHANGES, Channels, Ends, Evidence, Tensors, newest_frame
 
-VITAL = spaces.Box(-np.inf, np.inf, (), np.float32)
-
 
 @dataclass(frozen=True)
 class ConstantConfig:
@@ -72,7 +70,9 @@ class OutcomeConfig:
 
     actions: int  # numbers of an encoded action
     rewards: tuple[float, ...]  # values of the two-hot code of rewards, ascending
-    vitals: tuple[str, ...] = ()  # names of the player's numbers, such as "health" and "lives"
+    vitals: tuple[
+        str, ...
+    ] = ()  # channels of the player's numbers, such as "health"; a vector's name once for each number
     changes: tuple[tuple[float, ...], ...] = ()  # of each vital the changes that a step may bring, ascending
     spans: tuple[float, ...] = ()  # of each vital its usual size
     hidden: int = 64  # width of the GRU
@@ -136,8 +136,8 @@ class FrameOutcome(nn.Module):
     # -- as a part of a world -----------------------------------------------------------------------------------------
 
     def channels(self) -> Channels:
-        vitals = self.config.vitals
-        return Channels({"reward": REWARD, "done": DONE, **dict.fromkeys(vitals, VITAL)}, may_observe=vitals)
+        vitals = {name: _numbers(len(columns)) for name, columns in self._columns().items()}
+        return Channels({"reward": REWARD, "done": DONE, **vitals}, may_observe=tuple(vitals))
 
     def observe(self, prior: State | None, evidence: Evidence, observation: Mapping) -> Tensors:
         """An episode that goes on, with the vitals that evidence gives, else those of `prior`, else those of a new episode."""
@@ -148,12 +148,12 @@ class FrameOutcome(nn.Module):
         else:
             begun, known = {}, prior["vitals"]
         vitals = evidence.seen.get("vitals", known).clone()
-        for column, name in enumerate(self.config.vitals):
+        for name, columns in self._columns().items():
             if name in observation:
-                given = torch.as_tensor(observation[name]).float()
-                if given.shape != (len(vitals),) or not torch.isfinite(given).all():
-                    raise ObservationError(f"{name} is finite float [B]; got {tuple(given.shape)}.")
-                vitals[:, column] = given
+                given, shape = torch.as_tensor(observation[name]).float(), (len(vitals), *_numbers(len(columns)).shape)
+                if given.shape != shape or not torch.isfinite(given).all():
+                    raise ObservationError(f"{name} is finite float {list(shape)}; got {tuple(given.shape)}.")
+                vitals[:, columns] = given.reshape(len(vitals), -1).to(device)
         return {**_going(evidence), **begun, "vitals": vitals}
 
     def step(
@@ -165,8 +165,17 @@ class FrameOutcome(nn.Module):
         return {**outcome._asdict(), "done": outcome.done > 0}
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
-        columns = {name: column for column, name in enumerate(self.config.vitals) if name in channels}
-        return {name: state["vitals"][:, column].clone() for name, column in columns.items()}
+        wanted = {name: columns for name, columns in self._columns().items() if name in channels}
+        return {
+            name: state["vitals"][:, columns[0] if len(columns) == 1 else columns].clone()
+            for name, columns in wanted.items()
+        }
+
+    def _columns(self) -> dict[str, list[int]]:
+        """Of each channel its columns among the vitals."""
+        return {
+            name: [at for at, other in enumerate(self.config.vitals) if other == name] for name in self.config.vitals
+        }
 
     # -- the network --------------------------------------------------------------------------------------------------
 
@@ -213,6 +222,11 @@ class FrameOutcome(nn.Module):
             changes.append(levels[picked])
         left = vitals.float() + torch.stack(changes, 1) if changes else vitals
         return OutcomePrediction(reward, self.ends(read.known, left).float(), left, read.hidden.float())
+
+
+def _numbers(count: int) -> spaces.Box:
+    """The space of a channel of `count` numbers."""
+    return spaces.Box(-np.inf, np.inf, () if count == 1 else (count,), np.float32)
 
 
 def _going(evidence: Evidence) -> Tensors:

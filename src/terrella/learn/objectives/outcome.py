@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,8 @@ _LEVELS = 33  # values at most into which rewards and changes are discretised
 @dataclass(frozen=True)
 class Happenings:
     """The outcomes of the steps of a recording: action encoded for networks [N, A]; reward [N]; done [N]; vitals [N, V] before the
-    step; change [N, V] of the vitals; real bool [N]: whether the step was recorded and may be trained on."""
+    step; change [N, V] of the vitals; real bool [N]: whether the step was recorded and may be trained on; names [V]: the channel of
+    each vital."""
 
     action: np.ndarray
     reward: np.ndarray
@@ -36,12 +37,13 @@ class Happenings:
     names: tuple[str, ...]
 
     @staticmethod
-    def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray) -> Happenings:
-        """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see."""
-        names = tuple(cache.vitals)
-        vitals = np.zeros((cache.length, len(names)), np.float32)
-        for column, name in enumerate(names):
-            vitals[:, column] = np.asarray(cache.vitals[name], np.float32).reshape(cache.length)
+    def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray, vectors: Sequence[str] = ()) -> Happenings:
+        """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see; `vectors`: channels whose
+        numbers are vitals, too."""
+        chosen = cache.vitals | {name: cache.further[name] for name in vectors}
+        columns = {name: np.asarray(array, np.float32).reshape(cache.length, -1) for name, array in chosen.items()}
+        names = tuple(name for name, array in columns.items() for _ in range(array.shape[1]))
+        vitals = np.concatenate([np.zeros((cache.length, 0), np.float32), *columns.values()], 1)
         real = usable & np.roll(usable, -1) & np.asarray(cache.action_valid, bool)
         real[[stop - 1 for _, stop in cache.episodes]] = False  # nothing follows an episode's last row
         change = np.where(real[:, None], np.roll(vitals, -1, 0) - vitals, 0.0)

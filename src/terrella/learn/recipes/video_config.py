@@ -31,7 +31,10 @@ class TrainConfig:
     compile: bool = True
     half: bool = True  # --no-half: compute in float32 where the device computes bfloat16.
     frames: int = 4  # Number of past frames that a world without geometry sees.
-    # Training steps of the model that predicts reward, termination and vitals.
+    # Vectors of the recording, such as the place of a hand, that the world predicts beside its frames, so that policies that see
+    # them can act in it. Numbers that stand alone, such as health, are always predicted.
+    predict: tuple[str, ...] = ()
+    # Training steps of the model that predicts reward, termination, vitals and --predict.
     outcome_steps: int = 1500
     # Training steps of the objects, which are drawn as billboards that move, change and vanish. Needs a recording with object
     # instances. 0: no separate model, the generator draws them.

@@ -19,7 +19,7 @@ from ..objectives.flow import Flow
 from ..objectives.flow_frames import FlowFrames
 from ..objectives.outcome import Happenings, OutcomeObjective, learn_outcome
 from ..presets import TrainingPlan
-from ..recording import Recording
+from ..recording import Recording, vectors_of
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
@@ -62,7 +62,8 @@ class VideoParts:
     def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
         self.run, self.recording, self.config = run, recording, config
         self.facts: dict = {}  # of the stages so far, for the world's card
-        self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable)
+        vectors = [name for name, _ in vectors_of(recording, config.predict)] if config.predict else []
+        self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable, vectors)
         self.outcome: FrameOutcome | None = None
         if self.happened.is_informative and (video.moving or not video.geometry):
             begins = _first_vitals(self.happened.vitals, recording)
