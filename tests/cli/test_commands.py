@@ -17,11 +17,12 @@ from tests.worlds.made import place
 
 import terrella
 from terrella.care import doctor
-from terrella.cli import COMMANDS, main
+from terrella.cli import COMMANDS, main, record
 from terrella.core import make_rng
 from terrella.core.errors import TerrellaError
 from terrella.data import Dataset
 from terrella.workflows.acceleration import AccelerationConfig, measure_acceleration
+from terrella.workflows.collect import CollectResult
 from terrella.workflows.export_space import _eased
 from terrella.worlds.controls import CHOICE, Controls
 from terrella.worlds.folder import load_world, save_world
@@ -491,6 +492,13 @@ def test_whole_episodes_of_a_policy_are_recorded_by_workers_and_again(capsys, tm
 )
 def test_who_plays_and_how_much_is_checked(more, said, capsys, tmp_path):
     assert said in refusal(["record", "world", "gym:CartPole-v1", "--out", tmp_path / "set", *more], capsys)
+
+
+def test_what_comes_next_depends_on_who_was_recorded(tmp_path):
+    recorded = CollectResult(tmp_path / "set", {"look": "look.jpg"})
+    assert record._training(recorded, "teacher:0.1").startswith("terrella train policy --method imitation --from")
+    assert record._training(recorded, "explorer").startswith("terrella train video")
+    assert record._training(CollectResult(tmp_path, {}), "random").startswith("terrella train latent")
 
 
 def test_the_doctor_exits_with_1_where_a_recording_is_broken(capsys, tmp_path):

@@ -17,10 +17,12 @@ def record_world(name: WorldName, config: CollectConfig, json: Json = False) -> 
     Args:
         name: The environment (gym:ID), a name of `terrella list`, or the path of a checkpoint or run.
     """
-    show(recorded := collect(name, config, progress=say), json, _training(recorded))
+    show(recorded := collect(name, config, progress=say), json, _training(recorded, config.policy or ""))
 
 
-def _training(recorded: CollectResult) -> str:
-    """The command that trains a world on a recording: of pictures where it has any."""
-    kind = "video" if "look" in recorded.facts else "latent"
-    return command("terrella", "train", kind, recorded.dataset, out=f"runs/{folder_name(recorded.dataset.name)}")
+def _training(recorded: CollectResult, policy: str = "") -> str:
+    """The command that learns from a recording: of a teacher a policy, otherwise a world, of pictures where it has any."""
+    out = f"runs/{folder_name(recorded.dataset.name)}"
+    if policy.partition(":")[0] == "teacher":
+        return command("terrella", "train", "policy", method="imitation", **{"from": recorded.dataset}, out=out)
+    return command("terrella", "train", "video" if "look" in recorded.facts else "latent", recorded.dataset, out=out)
