@@ -115,7 +115,7 @@ def test_the_page_draws_what_pytorch_draws(opened, name):
         noise = noises[number][0, :3].permute(1, 2, 0).flatten().tolist()
         drawn = page.evaluate(STEP, [None if number else 0, actions[number][0].tolist(), noise, 3])
         off = (torch.tensor(drawn).view(*world.size, 3) - frame.int()).abs()
-        assert off.max() <= 1 and (off > 0).float().mean() < 1e-3, f"step {number}: {off.max()}"
+        assert off.max() <= 2 and (off > 0).float().mean() < 1e-2, f"step {number}: {off.max()}"
 
 
 @pytest.mark.browser

@@ -13,7 +13,7 @@ from ..core.errors import TerrellaError
 from ..serve.world_page import world_html
 from ..space.files import replace_whole
 from ..worlds.config import THUMBNAIL
-from ..worlds.flow import FlowNetwork
+from ..worlds.flow import FlowNetwork, times_of
 from ..worlds.frame_history import FrameHistory
 from ..worlds.learned import LearnedWorld
 from ..worlds.parts import Evidence
@@ -67,6 +67,7 @@ def _packed_network(network: FlowNetwork) -> tuple[dict[str, Any], bytes]:
     weights = torch.cat([part.flatten().float() for part in parts]).half().numpy().tobytes()
     about = {"size": config.size, "slots": config.slots, "channels": config.channels, "steps": config.steps}
     about |= {"recalls": config.recalls, "remembers": config.moves > 0 or config.recalls}
+    about["times"] = [times_of(steps, config.recalls) for steps in range(1, config.steps + 1)]
     return {**about, "layers": layers, "vectors": vectors}, weights
 
 

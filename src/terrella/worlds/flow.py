@@ -31,6 +31,7 @@ SQUARE = 4  # side in pixels of the squares that the U-Net sees
 WIDE = 128  # numbers of the embedding of actions and flow time
 DETAIL = 16  # features of each pixel from its square
 HEADS = 4  # of the attention over the coarsest map
+LATEST = 0.9  # the largest flow time, in training and in drawing
 STAYS = 0.04  # a colour that would change by less, of -1 to 1, stays as it is
 RECALLED = 0.15  # a colour that differs by less from the remembered one is as remembered
 FREQUENCIES = 8  # of the sines and cosines of the flow time
@@ -259,9 +260,10 @@ def _waves(time: torch.Tensor) -> torch.Tensor:
 
 
 def times_of(steps: int, recalls: bool) -> tuple[float, ...]:
-    """Flow times of drawing steps. With a frame that is recalled by the draft, the next step is a draft again, which sees it."""
+    """Flow times of drawing steps, up to the latest of training: what is drawn at an early one is nearly a mean of what may follow,
+    in which things slow down. With a frame that is recalled by the draft, the next step is a draft again, which sees it."""
     again = steps - 1 if recalls and steps > 1 else steps
-    return (0.0,) * (steps - again) + tuple(step / again for step in range(again))
+    return (0.0,) * (steps - again) + tuple(LATEST * step / max(1, again - 1) for step in range(again))
 
 
 def _waves_of_times(times: tuple[float, ...]) -> torch.Tensor:

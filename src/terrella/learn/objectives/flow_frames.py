@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from ...space.matching import scroll_index
 from ...space.recall import EMPTY, KEPT, keys_of
 from ...worlds.controls import Controls
-from ...worlds.flow import FlowFeatures, FlowNetwork, carry
+from ...worlds.flow import LATEST, FlowFeatures, FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
 from ..devices import Captured, Compiled
 from ..learners import Ema, warmup_cosine
@@ -27,7 +27,6 @@ CHANGED = 8  # difference of 255 by which a pixel changes
 DRAFTS = 0.4  # the part of the training that learns drafts alone
 FRAMES_JUDGED = 3  # what the critic sees: a frame, its change, and the change before
 CRITIC_WEIGHT = 0.5  # of the critic's gradient, relative to the loss
-LATEST = 0.9  # the largest flow time in training
 # Parts of the clips that see no memory, and all of it; the others see what the last frame showed.
 BLIND, WHOLE = 0.4, 0.3
 RECORDED = 400  # gradient steps on recorded frames alone, before rollouts begin

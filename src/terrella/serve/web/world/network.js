@@ -9,8 +9,9 @@ function single(half) {
 }
 
 export class Network {
-  /** about: "size", "slots", "channels", "steps", "recalls", "remembers" and "layers", [name, inputs, outputs] in the order of `weights`, a
-   * Uint16Array of float16: of each layer its matrix in panels of eight outputs, and its bias; then its "vectors", [name, length]. */
+  /** about: "size", "slots", "channels", "steps", "times" (of one drawing step, of two ...), "recalls", "remembers" and "layers", [name,
+   * inputs, outputs] in the order of `weights`, a Uint16Array of float16: of each layer its matrix in panels of eight outputs, and its bias;
+   * then its "vectors", [name, length]. */
   constructor(exports, about, weights) {
     Object.assign(this, about);
     this.wasm = exports;
@@ -174,10 +175,8 @@ export class Network {
   sample(frames, context, base, known, noise, steps, recall) {
     const relative = known ? this.relative(known, base) : this.remembers ? new Float32Array(base.length / 3 * 4) : null;
     const seen = this.encode(frames, context, base, relative);
-    const again = this.recalls && steps > 1 ? steps - 1 : steps;
     let x = base;
-    for (let step = 0; step < steps; step++) {
-      const time = Math.max(0, step - (steps - again)) / again;
+    for (const [step, time] of this.times[steps - 1].entries()) {
       if (step === 1 && this.recalls) seen.remembered = recall(x) ?? relative;
       const noisy = time ? x.map((value, i) => noise[i] + time * (Math.min(1, Math.max(-1, value)) - noise[i])) : base;
       x = this.clean(seen, noisy, time);
