@@ -38,7 +38,11 @@ def turned(heading: torch.Tensor) -> torch.Tensor:
 class Carousel:
     """Three cameras on a disc that an action turns, in a round room of colours that change smoothly with the direction."""
 
-    def __init__(self):
+    def __init__(self, turns: float = 0.3, rolls: float = 0.0):
+        self.turns, self.rolls = (
+            turns,
+            rolls,
+        )  # radians of an action by which the disc turns, and of its heading the left camera
         channels = {name: spaces.Box(0, 255, (*SIZE, 3), np.uint8) for name in YAWS}
         channels |= {name.replace("rgb", "pose"): POSE for name in YAWS} | {"reward": REWARD}
         cameras = {name: Camera(FIELD, SIZE, name.replace("rgb", "pose")) for name in YAWS}
@@ -51,7 +55,7 @@ class Carousel:
         return prior
 
     def imagine(self, state, action, rng):
-        return state.replace(heading=state["heading"] + 0.3 * action[:, 0])
+        return state.replace(heading=state["heading"] + self.turns * action[:, 0])
 
     def render(self, state, channels):
         shown = {}
@@ -61,6 +65,7 @@ class Carousel:
                 shown[name] = state["heading"].float()
                 continue
             pose = turned(state["heading"] + YAWS[f"rgb.{suffix}" if suffix else "rgb"])
+            pose = turned(state["heading"] * (1 + self.rolls)) if suffix == "left" and self.rolls else pose
             if kind == "pose":
                 shown[name] = pose
                 continue
@@ -100,6 +105,19 @@ def test_pictures_lie_side_by_side_from_left_to_right(recorded):
     assert np.array_equal(ring.cache.rgb[3, :, 48:], alone.cache.arrays[dataset.feature("rgb.right")][3])
     yaws = [2 * math.atan2(lens.mount[6], lens.mount[3]) for lens in ring.lenses().values()]
     np.testing.assert_allclose(yaws, [YAWS[name] for name in names], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "world", [Carousel(rolls=0.5), Carousel(turns=0.0)], ids=["one turns by itself", "all stand still"]
+)
+def test_cameras_that_no_body_carries_are_not_made_to_agree(world, tmp_path):
+    state = world.start(1, make_rng(0))
+    world.start = lambda batch, rng: state  # one place in all episodes
+    options = RecordOptions(pictures="png", max_episode_steps=40)
+    record(world, Random(world.spec, (2, 5)), tmp_path, 80, make_rng(0), options=options)
+    dataset = Dataset(tmp_path)
+    ring = Recording.open(dataset, None, quiet, joined=joined_cameras(dataset))
+    assert len(ring.cameras) == 3 and ring.lenses() == {}
 
 
 def test_a_world_of_three_cameras_is_learned_saved_and_plays(recorded, tmp_path):

@@ -30,6 +30,7 @@ from .trainer import Report
 THINGS = "observation.things"  # the mask of what may move or vanish
 OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # the table of objects, and their segmentation
 FEWEST = 64  # rows that can be trained on
+MOUNT_ROWS = 256  # rows of which cameras' poses are compared
 MOST = 96 * 128  # pixels of a frame by default
 WIDEST = 512  # numbers of a channel at most, to be treated as a vector
 NO_VECTORS = frozenset(
@@ -138,16 +139,23 @@ class Recording:
         return () if source is None else tuple(name for name in source.cameras if name not in used)
 
     def lenses(self) -> dict[str, Camera]:
-        """The cameras that are joined, mounted as their poses say relative to the main one; {} where that was not recorded."""
+        """The cameras that are joined, if a body carries them, mounted as their poses say relative to the main one. {} where that
+        was not recorded, where one turns by itself (as at a wrist), and where all stand still and look at near things."""
         cache, known = self.cache, self.cache.world.get("cameras") or {}
         names = {name: f"pose{name.removeprefix('rgb')}" for name in self.cameras if name in known}
         arrays = {name: array_for(pose, cache.arrays, cache.keys) for name, pose in names.items()}
         if not arrays or None in arrays.values() or "rgb" not in arrays:
             return {}
-        poses = {name: torch.tensor(np.asarray(cache.arrays[array][0], np.float32)) for name, array in arrays.items()}
+        rows = np.unique(np.linspace(0, cache.length - 1, MOUNT_ROWS).astype(int))
+        poses = {
+            name: torch.tensor(np.asarray(cache.arrays[array][rows], np.float32)) for name, array in arrays.items()
+        }
+        mounts = {name: relative_pose(poses["rgb"], pose) for name, pose in poses.items()}
+        if _all_alike(poses["rgb"]) or not all(_all_alike(mount) for mount in mounts.values()):
+            return {}
         size = cache.rgb.shape[1], cache.rgb.shape[2] // len(self.cameras)
-        mounts = {name: tuple(relative_pose(poses["rgb"], pose).tolist()) for name, pose in poses.items()}
-        return {name: Camera(tuple(known[name]["intrinsics"]), size, None, mount) for name, mount in mounts.items()}
+        views = {name: (tuple(known[name]["intrinsics"]), tuple(mount[0].tolist())) for name, mount in mounts.items()}
+        return {name: Camera(intrinsics, size, None, mount) for name, (intrinsics, mount) in views.items()}
 
     @property
     def posed(self) -> bool:
@@ -310,6 +318,12 @@ def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tupl
         )
     chosen = wanted or [name for name in widths if usually_seen(name)]
     return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
+
+
+def _all_alike(poses: torch.Tensor) -> bool:
+    """Whether poses [N, 7] differ by less than a centimetre and a degree or two."""
+    near = (poses[:, :3] - poses[:1, :3]).norm(dim=1) < 0.01
+    return bool((near & ((poses[:, 3:] * poses[:1, 3:]).sum(1).abs() > 0.9999)).all())
 
 
 def learned_size(height: int, width: int, most: int = MOST) -> tuple[int, int]:
