@@ -26,7 +26,7 @@ from terrella.worlds.frame_history import FrameHistory, StartClips
 from terrella.worlds.generator import UNet
 from terrella.worlds.learned import About, LearnedWorld
 from terrella.worlds.outcome import FrameOutcome
-from terrella.worlds.parts import Evidence
+from terrella.worlds.parts import CHANGES, Evidence
 
 from ..data.layouts import layout_of
 
@@ -120,8 +120,11 @@ def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
     assert both.names == ("lives", "place", "place") and happened.names == ("lives",)
     assert np.array_equal(both.vitals[:, 2], 2 * both.vitals[:, 1]) and both.vitals[:, 1].max() == 5
     config = both.config()
-    assert config.changes == ((-1.0, 0.0), (-1.0, 0.0, 1.0), (-2.0, 0.0, 2.0))
+    assert config.changes[0] == (-1.0, 0.0)
+    assert [len(usual) for usual in config.changes[1:]] == [1, 1]
+    assert config.changes[2][0] == pytest.approx(2 * config.changes[1][0])
     outcome = FrameOutcome(config)
+    assert list(outcome.draws) == [CHANGES], "what is regressed is not drawn"
     assert outcome.channels().shows["place"].shape == (2,) and outcome.channels().shows["lives"].shape == ()
     assert outcome.channels().may_observe == ("lives", "place")
     begun = Evidence(3, torch.device("cpu"), {})
@@ -131,6 +134,18 @@ def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
     assert torch.equal(outcome.render(state, ("lives",))["lives"], torch.zeros(3))
     with pytest.raises(ObservationError, match=re.escape("place is finite float [3, 2]; got (3,)")):
         outcome.observe(None, begun, {"place": place[:, 0]})
+
+
+def test_vectors_are_read_off_episodes_that_it_never_saw(learned, tmp_path):
+    cache, seen, _, _ = learned
+    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, ["place"])
+    torch.manual_seed(0)
+    outcome = FrameOutcome(both.config())
+    learn_outcome(Run(tmp_path, {}, quiet), OutcomeObjective(outcome, seen.rgb, both, 6, 5e-3), 120)
+    first, stop = list(cache.episodes)[21]
+    found = examine_outcome(outcome, seen.rgb, both, first, stop)["change"]
+    right = np.diff(both.vitals[first:stop], axis=0)
+    assert np.square(found - right)[:, 1:].mean() < 0.1 * np.square(right)[:, 1:].mean()
 
 
 def test_a_vital_that_changes_at_ends_alone_has_its_size_after_them(learned):

@@ -73,7 +73,8 @@ class OutcomeConfig:
     vitals: tuple[
         str, ...
     ] = ()  # channels of the player's numbers, such as "health"; a vector's name once for each number
-    changes: tuple[tuple[float, ...], ...] = ()  # of each vital the changes that a step may bring, ascending
+    # Of each vital the changes that a step may bring, ascending; of a vector's number, which has no such levels, their usual size.
+    changes: tuple[tuple[float, ...], ...] = ()
     spans: tuple[float, ...] = ()  # of each vital its usual size
     hidden: int = 64  # width of the GRU
     side: int = 64  # pixels; larger frames are shrunk to it
@@ -93,7 +94,9 @@ class OutcomeLogits(NamedTuple):
     """What the network reads off two frames."""
 
     reward: torch.Tensor  # [B, len(rewards)]
-    changes: list[torch.Tensor]  # of each vital [B, len(changes)]
+    changes: list[
+        torch.Tensor
+    ]  # of each vital [B, len(changes)]; of a vector's number [B, 1] the change over its usual size
     hidden: torch.Tensor  # [B, hidden]
     known: torch.Tensor  # [B, inner], what was seen and remembered
 
@@ -103,7 +106,8 @@ class FrameOutcome(nn.Module):
     """A small convolutional network over the frames before and after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values of the recording (two-hot, as in Dreamer 3). A reward is the
-    expectation; the change of a vital is sampled, so that a count of lives stays whole. The end depends on the vitals, too.
+    expectation; the change of a vital is sampled, so that a count of lives stays whole. That of a vector's number is regressed, and
+    sees the action once more. The end depends on the vitals, too.
     """
 
     kind = "frames"
@@ -121,13 +125,15 @@ class FrameOutcome(nn.Module):
         self.paid = nn.Linear(inner, len(config.rewards))
         self.ending = nn.Linear(inner + 2 * len(config.vitals), 1)
         nn.init.constant_(self.ending.bias, -3.0)  # few steps are the last
-        self.changed = nn.ModuleList(nn.Linear(inner, len(levels)) for levels in config.changes)
+        self.changed = nn.ModuleList(
+            nn.Linear(inner + config.actions * is_regressed(levels), len(levels)) for levels in config.changes
+        )
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
     @property
     def draws(self) -> Mapping[int, Sequence[int]]:
         """See parts.Outcome."""
-        return {CHANGES + column: () for column in range(len(self.config.vitals))}
+        return {CHANGES + column: () for column, levels in enumerate(self.config.changes) if not is_regressed(levels)}
 
     def begin(self, batch: int) -> torch.Tensor:
         """The hidden state of a new episode: [batch, hidden]."""
@@ -194,7 +200,9 @@ class FrameOutcome(nn.Module):
         spans = constant(torch.tensor, seen.device, self.config.spans)
         hidden = self.remember(torch.cat([seen, action, vitals / spans], 1), hidden)
         known = torch.cat([seen, hidden], 1)
-        return OutcomeLogits(self.paid(known), [head(known) for head in self.changed], hidden, known)
+        more, levels = torch.cat([known, action], 1), self.config.changes
+        changes = [head(more if is_regressed(each) else known) for head, each in zip(self.changed, levels)]
+        return OutcomeLogits(self.paid(known), changes, hidden, known)
 
     def ends(self, known: torch.Tensor, vitals: torch.Tensor) -> torch.Tensor:
         """The logit [B] that the episode is over, from OutcomeLogits.known and the vitals [B, V] after the step."""
@@ -217,11 +225,19 @@ class FrameOutcome(nn.Module):
         reward = (read.reward.float().softmax(1) * self.rewards).sum(1)
         changes = []
         for column, (logits, values) in enumerate(zip(read.changes, self.config.changes)):
+            if is_regressed(values):
+                changes.append(values[0] * logits[:, 0].float())
+                continue
             levels, likely = constant(torch.tensor, logits.device, values), logits.float().softmax(1)
             picked = logits.argmax(1) if chances is None else chance.chosen(chances[CHANGES + column], likely)
             changes.append(levels[picked])
         left = vitals.float() + torch.stack(changes, 1) if changes else vitals
         return OutcomePrediction(reward, self.ends(read.known, left).float(), left, read.hidden.float())
+
+
+def is_regressed(levels: tuple[float, ...]) -> bool:
+    """Whether a vital with these `changes` changes by any amount."""
+    return len(levels) == 1
 
 
 def _numbers(count: int) -> spaces.Box:

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ...data import ClipCache
-from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
+from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits, is_regressed
 from ..feeds import RandomBatches
 from ..learners import Learner, warmup_cosine
 from ..sized_feed import SizedFeed
@@ -26,7 +26,7 @@ _LEVELS = 33  # values at most into which rewards and changes are discretised
 class Happenings:
     """The outcomes of the steps of a recording: action encoded for networks [N, A]; reward [N]; done [N]; vitals [N, V] before the
     step; change [N, V] of the vitals; real bool [N]: whether the step was recorded and may be trained on; names [V]: the channel of
-    each vital."""
+    each vital; vectors: those of them that change by any amount."""
 
     action: np.ndarray
     reward: np.ndarray
@@ -35,6 +35,7 @@ class Happenings:
     change: np.ndarray
     real: np.ndarray
     names: tuple[str, ...]
+    vectors: tuple[str, ...] = ()
 
     @staticmethod
     def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray, vectors: Sequence[str] = ()) -> Happenings:
@@ -49,7 +50,9 @@ class Happenings:
         change = np.where(real[:, None], np.roll(vitals, -1, 0) - vitals, 0.0)
         nothing = np.zeros(cache.length, np.float32)
         reward, done = (nothing if part is None else np.array(part) for part in (cache.reward, cache.done))
-        return Happenings(action, reward.astype(np.float32), done.astype(bool), vitals, change, real, names)
+        return Happenings(
+            action, reward.astype(np.float32), done.astype(bool), vitals, change, real, names, tuple(vectors)
+        )
 
     @property
     def is_informative(self) -> bool:
@@ -65,7 +68,10 @@ class Happenings:
 
     def config(self, cameras: int = 1) -> OutcomeConfig:
         """Of frames in which the pictures of this many cameras lie side by side."""
-        changes = tuple(levels(self.change[self.real, column]) for column in range(len(self.names)))
+        changes = tuple(
+            (float(np.sqrt(np.square(of).mean())) or 1.0,) if name in self.vectors else levels(of)
+            for name, of in zip(self.names, self.change[self.real].T)
+        )
         before, change = self.vitals[self.real], self.change[self.real]
         largest = np.maximum(np.abs(before), np.abs(before + change)).max(0, initial=0)  # some change at the end alone
         spans = tuple(float(span) or 1.0 for span in largest)
@@ -113,7 +119,8 @@ class OutcomeObjective:
         eventful = (sums[self.starts + LENGTH] - sums[self.starts]).astype(float)
         self.even = np.full(len(self.starts), 1 / max(1, len(self.starts)))
         self.often = 0.5 * self.even + 0.5 * (eventful / eventful.sum() if eventful.any() else self.even)
-        heads = [weight for head in (outcome.paid, outcome.ending, *outcome.changed) for weight in head.parameters()]
+        changed = [head for head, usual in zip(outcome.changed, outcome.config.changes) if not is_regressed(usual)]
+        heads = [weight for head in (outcome.paid, outcome.ending, *changed) for weight in head.parameters()]
         known = {id(weight) for weight in heads}
         body = [weight for weight in outcome.parameters() if id(weight) not in known]
         groups = [{"params": body}, {"params": heads, "pace": 8.0}]  # only the heads learn from rare events at first
@@ -155,6 +162,9 @@ class OutcomeObjective:
         """Changes [B, V] of the vitals, drawn from what is predicted."""
         drawn = [predicted.hidden.new_zeros(len(predicted.hidden), 0)]
         for logits, values in zip(predicted.changes, self.outcome.config.changes):
+            if is_regressed(values):
+                drawn.append(values[0] * logits.detach())
+                continue
             upto = logits.detach().float().softmax(1).cumsum(1)
             pick = (upto < now.rand(len(upto), 1)).sum(1, keepdim=True).clamp_max(len(values) - 1)
             drawn.append(torch.tensor(values, device=upto.device)[pick])
@@ -180,10 +190,13 @@ def negative_log_likelihood(
     done: torch.Tensor,
     change: torch.Tensor,
 ) -> torch.Tensor:
-    """[B], in nats, of recorded reward [B], done [B] and change [B, V]; ends [B] is the logit of termination."""
+    """[B], in nats (of vectors Huber's loss), of recorded reward [B], done [B], change [B, V]; ends [B]: logit of termination."""
     total = F.cross_entropy(predicted.reward, two_hot(reward, torch.tensor(config.rewards)), reduction="none")
     total = total + F.binary_cross_entropy_with_logits(ends, done, reduction="none")
     for column, (logits, values) in enumerate(zip(predicted.changes, config.changes)):
+        if is_regressed(values):
+            total = total + F.huber_loss(logits[:, 0], change[:, column] / values[0], reduction="none")
+            continue
         right = two_hot(change[:, column], torch.tensor(values))
         total = total + F.cross_entropy(logits, right, reduction="none")
     return total
