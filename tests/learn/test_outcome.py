@@ -127,7 +127,7 @@ def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
     assert list(outcome.draws) == [CHANGES], "what is regressed is not drawn"
     assert outcome.channels().shows["place"].shape == (2,) and outcome.channels().shows["lives"].shape == ()
     assert outcome.channels().may_observe == ("lives", "place")
-    begun = Evidence(3, torch.device("cpu"), {})
+    begun = Evidence(3, torch.device("cpu"))
     place = torch.tensor([[1.0, 2.0], [3.0, 6.0], [0.0, 0.0]])
     state = State(outcome.observe(None, begun, {"place": place}))
     assert torch.equal(outcome.render(state, ("place",))["place"], place)
