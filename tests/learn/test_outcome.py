@@ -12,11 +12,13 @@ from gymnasium import spaces
 from tests.learn.stopping import quiet
 
 from terrella.core import chance, check_world, make_rng
-from terrella.core.errors import DatasetError, ObservationError
+from terrella.core.errors import DatasetError, ObservationError, TrainingError
 from terrella.core.state import State
 from terrella.data import ClipCache, Recorder
 from terrella.learn.objectives.outcome import Happenings, OutcomeObjective, learn_outcome, levels, two_hot
+from terrella.learn.recipes.adapt_frames import settings_of
 from terrella.learn.recipes.video import TrainConfig, train_video
+from terrella.learn.recipes.video_parts import vectors_to_predict
 from terrella.learn.recording import Recording, controls_of
 from terrella.learn.train_step import TrainStep
 from terrella.learn.trainer import Run
@@ -120,13 +122,11 @@ def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
     assert both.names == ("lives", "place", "place") and happened.names == ("lives",)
     assert np.array_equal(both.vitals[:, 2], 2 * both.vitals[:, 1]) and both.vitals[:, 1].max() == 5
     config = both.config()
-    assert config.changes[0] == (-1.0, 0.0)
-    assert [len(usual) for usual in config.changes[1:]] == [1, 1]
-    assert config.changes[2][0] == pytest.approx(2 * config.changes[1][0])
+    assert config.changes == ((-1.0, 0.0),) and config.sizes[1] == pytest.approx(2 * config.sizes[0])
     outcome = FrameOutcome(config)
     assert list(outcome.draws) == [CHANGES], "what is regressed is not drawn"
     assert outcome.channels().shows["place"].shape == (2,) and outcome.channels().shows["lives"].shape == ()
-    assert outcome.channels().may_observe == ("lives", "place")
+    assert outcome.channels().may_observe == ("lives", "place") and outcome.vectors == ("place",)
     begun = Evidence(3, torch.device("cpu"))
     place = torch.tensor([[1.0, 2.0], [3.0, 6.0], [0.0, 0.0]])
     state = State(outcome.observe(None, begun, {"place": place}))
@@ -221,12 +221,14 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
         uncertainty_frames=0,
         strip_every_s=1e9,
         channels=(8, 8, 8),
-        predict=("place",),
+        predict=("place", "lives", "place"),
     )
     train_video(recording, tmp_path, config, quiet)
     world = load_world(tmp_path / "world")
     assert world.spec.action == spaces.Discrete(3) and world.spec.action_names == ("STAY", "L", "R")
     assert {"reward", "done", "lives"} <= set(world.spec.channels)
+    assert settings_of(world).predict == ("place",), "a student or an adapted world predicts it, too"
+    assert world.outcome.config.changes == ((-1.0, 0.0),), "a count stays whole, whatever --predict says"
     assert "states_can_be_saved" in check_world(world)
     state = world.start(16, make_rng(0))
     began, place = (world.render(state, (name,))[name] for name in ("lives", "place"))
@@ -235,8 +237,10 @@ def test_a_history_world_is_trained_on_a_choice_with_its_outcome(recording, tmp_
 
 
 def test_a_vector_that_no_recording_has_is_refused(recording, tmp_path):
-    with pytest.raises(DatasetError, match="no vector hand; it has lives, place"):
-        train_video(recording, tmp_path, TrainConfig(size=SIZE, predict=("hand",)), quiet)
+    with pytest.raises(DatasetError, match="no vector hand, drifted; it has lives, place"):
+        train_video(recording, tmp_path, TrainConfig(size=SIZE, predict=("hand", "place", "drifted")), quiet)
+    with pytest.raises(TrainingError, match="add --no-geometry"):
+        vectors_to_predict(Recording.open(recording, SIZE, quiet), ("place",), VideoConfig((1.0, 1.0, 0.5, 0.5), 3))
 
 
 def test_a_dream_pays_costs_lives_and_ends(learned):

@@ -15,7 +15,6 @@ import torch.nn.functional as F
 from ..core.errors import DatasetError
 from ..core.spec import Camera, Spec, kind_of
 from ..data import ClipCache, Dataset, split
-from ..data.channels import usually_seen
 from ..data.training.cache import array_for, episodes_with, further_cameras
 from ..space.camera import Intrinsics, relative_pose, yaw
 from ..space.floorplan import Box, horizon, sees_into
@@ -32,10 +31,6 @@ OBJECTS, INSTANCES = "observation.objects", "observation.instances"  # the table
 FEWEST = 64  # rows that can be trained on
 MOUNT_ROWS = 256  # rows of which cameras' poses are compared
 MOST = 96 * 128  # pixels of a frame by default
-WIDEST = 512  # numbers of a channel at most, to be treated as a vector
-NO_VECTORS = frozenset(
-    "rgb depth reward done done_probability uncertainty known keyframes mosaic instruction latent".split()
-)  # kinds of channels that are not learned as vectors
 
 
 @dataclass(frozen=True)
@@ -140,16 +135,18 @@ class Recording:
 
     def lenses(self) -> dict[str, Camera]:
         """The cameras that are joined, if a body carries them, mounted as their poses say relative to the main one. {} where that
-        was not recorded, where one turns by itself (as at a wrist), and where all stand still and look at near things."""
+        was not recorded, where one turns by itself (as at a wrist), and where all stand still."""
         cache, known = self.cache, self.cache.world.get("cameras") or {}
         names = {name: f"pose{name.removeprefix('rgb')}" for name in self.cameras if name in known}
         arrays = {name: array_for(pose, cache.arrays, cache.keys) for name, pose in names.items()}
         if not arrays or None in arrays.values() or "rgb" not in arrays:
             return {}
-        rows = np.unique(np.linspace(0, cache.length - 1, MOUNT_ROWS).astype(int))
-        poses = {
-            name: torch.tensor(np.asarray(cache.arrays[array][rows], np.float32)) for name, array in arrays.items()
-        }
+        lacking = {number for array in arrays.values() for number in cache.absent.get(str(array), ())}
+        rows = np.flatnonzero(self.usable & ~np.isin(self.start, [cache.episodes[number][0] for number in lacking]))
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, MOUNT_ROWS).astype(int))]
+        exact = {name: np.asarray(cache.arrays[array][rows], np.float64) for name, array in arrays.items()}
+        origin = np.append(exact["rgb"][0, :3], np.zeros(4))  # large coordinates are inexact in float32
+        poses = {name: torch.tensor(pose - origin, dtype=torch.float32) for name, pose in exact.items()}
         mounts = {name: relative_pose(poses["rgb"], pose) for name, pose in poses.items()}
         if _all_alike(poses["rgb"]) or not all(_all_alike(mount) for mount in mounts.values()):
             return {}
@@ -296,28 +293,6 @@ def joined_cameras(dataset: Dataset, geometry: bool = True) -> tuple[str, ...]:
     turned = yaw(first) - yaw(first[:1])
     to_left = torch.atan2(turned.sin(), turned.cos())
     return tuple(names[at] for at in to_left.argsort(descending=True).tolist())
-
-
-def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
-    """(channel, width) of the vectors of a recording, such as state, pose and vitals: those usually seen, or those in `wanted`."""
-    cache, widths = recording.cache, {}
-    for channel, key in cache.keys.items():
-        array = cache.arrays.get(key)
-        if (
-            array is None
-            or kind_of(channel) in NO_VECTORS
-            or key in ("action", "action_valid", "task")
-            or array.ndim > 2
-        ):
-            continue
-        if (width := int(np.prod(array.shape[1:]))) <= WIDEST:
-            widths[channel] = width
-    if lacks := [name for name in wanted if name not in widths]:
-        raise DatasetError(
-            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(widths)) or 'none'}."
-        )
-    chosen = wanted or [name for name in widths if usually_seen(name)]
-    return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
 
 
 def _all_alike(poses: torch.Tensor) -> bool:

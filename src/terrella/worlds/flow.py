@@ -261,8 +261,8 @@ def _waves(time: torch.Tensor) -> torch.Tensor:
 
 def times_of(steps: int, recalls: bool) -> tuple[float, ...]:
     """Flow times of drawing steps. They end at the latest of training: what is drawn earlier is nearly a mean of what may follow,
-    in which things slow down. With a frame that is recalled by the draft the next step is a draft again, which sees it; there a
-    late last step is sharper, but further from the truth."""
+    in which things slow down. With a frame that is recalled by the draft the next step is a draft again, which sees it; a late
+    last step is further from the truth there (MiniWorld's rooms)."""
     if recalls and steps > 1:
         return (0.0, *(step / (steps - 1) for step in range(steps - 1)))
     return tuple(LATEST * step / max(1, steps - 1) for step in range(steps))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple, final
@@ -35,6 +36,7 @@ class ConstantOutcome:
 
     kind = "constant"
     begins: tuple[float, ...] = ()
+    vectors: tuple[str, ...] = ()
     draws: Mapping[int, Sequence[int]] = MappingProxyType({})
 
     def __init__(self, config: ConstantConfig):
@@ -70,11 +72,12 @@ class OutcomeConfig:
 
     actions: int  # numbers of an encoded action
     rewards: tuple[float, ...]  # values of the two-hot code of rewards, ascending
-    vitals: tuple[
-        str, ...
-    ] = ()  # channels of the player's numbers, such as "health"; a vector's name once for each number
-    # Of each vital the changes that a step may bring, ascending; of a vector's number, which has no such levels, their usual size.
-    changes: tuple[tuple[float, ...], ...] = ()
+    # Channels of the player's numbers, such as "health"; then those of vectors, each once for each of its numbers.
+    vitals: tuple[str, ...] = ()
+    changes: tuple[
+        tuple[float, ...], ...
+    ] = ()  # of each vital that is no vector's the changes that a step may bring, ascending
+    sizes: tuple[float, ...] = ()  # of each number of vectors the usual size of its change
     spans: tuple[float, ...] = ()  # of each vital its usual size
     hidden: int = 64  # width of the GRU
     side: int = 64  # pixels; larger frames are shrunk to it
@@ -94,9 +97,8 @@ class OutcomeLogits(NamedTuple):
     """What the network reads off two frames."""
 
     reward: torch.Tensor  # [B, len(rewards)]
-    changes: list[
-        torch.Tensor
-    ]  # of each vital [B, len(changes)]; of a vector's number [B, 1] the change over its usual size
+    changes: list[torch.Tensor]  # of each vital that is no vector's [B, len(changes)]
+    numbers: torch.Tensor  # [B, len(sizes)], changes of vectors over their usual sizes
     hidden: torch.Tensor  # [B, hidden]
     known: torch.Tensor  # [B, inner], what was seen and remembered
 
@@ -106,8 +108,8 @@ class FrameOutcome(nn.Module):
     """A small convolutional network over the frames before and after a step, and a GRU cell that remembers.
 
     Rewards and changes are classified among the values of the recording (two-hot, as in Dreamer 3). A reward is the
-    expectation; the change of a vital is sampled, so that a count of lives stays whole. That of a vector's number is regressed, and
-    sees the action once more. The end depends on the vitals, too.
+    expectation; the change of a vital is sampled, so that a count of lives stays whole. Changes of vectors are regressed, from
+    the action once more. The end depends on the vitals, too.
     """
 
     kind = "frames"
@@ -123,17 +125,22 @@ class FrameOutcome(nn.Module):
         self.remember = nn.GRUCell(128 + config.actions + len(config.vitals), config.hidden)
         inner = 128 + config.hidden
         self.paid = nn.Linear(inner, len(config.rewards))
-        self.ending = nn.Linear(inner + 2 * len(config.vitals), 1)
+        self.ending = nn.Linear(inner + len(config.vitals) + len(config.changes), 1)
         nn.init.constant_(self.ending.bias, -3.0)  # few steps are the last
-        self.changed = nn.ModuleList(
-            nn.Linear(inner + config.actions * is_regressed(levels), len(levels)) for levels in config.changes
-        )
+        self.changed = nn.ModuleList(nn.Linear(inner, len(levels)) for levels in config.changes)
+        self.regressed = nn.Linear(inner + config.actions, len(config.sizes)) if config.sizes else None
+        self._widths = Counter(config.vitals)  # of each channel, in the order of its columns
         self.register_buffer("rewards", torch.tensor(config.rewards), persistent=False)
 
     @property
     def draws(self) -> Mapping[int, Sequence[int]]:
         """See parts.Outcome."""
-        return {CHANGES + column: () for column, levels in enumerate(self.config.changes) if not is_regressed(levels)}
+        return {CHANGES + column: () for column in range(len(self.config.changes))}
+
+    @property
+    def vectors(self) -> tuple[str, ...]:
+        """See parts.Outcome."""
+        return tuple(self._widths)[len(self.config.changes) :]
 
     def begin(self, batch: int) -> torch.Tensor:
         """The hidden state of a new episode: [batch, hidden]."""
@@ -142,7 +149,7 @@ class FrameOutcome(nn.Module):
     # -- as a part of a world -----------------------------------------------------------------------------------------
 
     def channels(self) -> Channels:
-        vitals = {name: _numbers(len(columns)) for name, columns in self._columns().items()}
+        vitals = {name: _numbers(width) for name, width in self._widths.items()}
         return Channels({"reward": REWARD, "done": DONE, **vitals}, may_observe=tuple(vitals))
 
     def observe(self, prior: State | None, evidence: Evidence, observation: Mapping) -> Tensors:
@@ -154,12 +161,12 @@ class FrameOutcome(nn.Module):
         else:
             begun, known = {}, prior["vitals"]
         vitals = evidence.seen.get("vitals", known).clone()
-        for name, columns in self._columns().items():
+        for name, columns in self._columns():
             if name in observation:
-                given, shape = torch.as_tensor(observation[name]).float(), (len(vitals), *_numbers(len(columns)).shape)
+                given, shape = torch.as_tensor(observation[name]).float(), vitals[:, columns].shape
                 if given.shape != shape or not torch.isfinite(given).all():
                     raise ObservationError(f"{name} is finite float {list(shape)}; got {tuple(given.shape)}.")
-                vitals[:, columns] = given.reshape(len(vitals), -1).to(device)
+                vitals[:, columns] = given.to(device)
         return {**_going(evidence), **begun, "vitals": vitals}
 
     def step(
@@ -171,17 +178,14 @@ class FrameOutcome(nn.Module):
         return {**outcome._asdict(), "done": outcome.done > 0}
 
     def render(self, state: State, channels: Sequence[str]) -> Tensors:
-        wanted = {name: columns for name, columns in self._columns().items() if name in channels}
-        return {
-            name: state["vitals"][:, columns[0] if len(columns) == 1 else columns].clone()
-            for name, columns in wanted.items()
-        }
+        return {name: state["vitals"][:, at].clone() for name, at in self._columns() if name in channels}
 
-    def _columns(self) -> dict[str, list[int]]:
-        """Of each channel its columns among the vitals."""
-        return {
-            name: [at for at, other in enumerate(self.config.vitals) if other == name] for name in self.config.vitals
-        }
+    def _columns(self) -> Iterable[tuple[str, int | slice]]:
+        """Of each channel its column among the vitals, of a vector its columns."""
+        at = 0
+        for name, width in self._widths.items():
+            yield name, at if width == 1 else slice(at, at + width)
+            at += width
 
     # -- the network --------------------------------------------------------------------------------------------------
 
@@ -200,14 +204,13 @@ class FrameOutcome(nn.Module):
         spans = constant(torch.tensor, seen.device, self.config.spans)
         hidden = self.remember(torch.cat([seen, action, vitals / spans], 1), hidden)
         known = torch.cat([seen, hidden], 1)
-        more, levels = torch.cat([known, action], 1), self.config.changes
-        changes = [head(more if is_regressed(each) else known) for head, each in zip(self.changed, levels)]
-        return OutcomeLogits(self.paid(known), changes, hidden, known)
+        numbers = known[:, :0] if self.regressed is None else self.regressed(torch.cat([known, action], 1))
+        return OutcomeLogits(self.paid(known), [head(known) for head in self.changed], numbers, hidden, known)
 
     def ends(self, known: torch.Tensor, vitals: torch.Tensor) -> torch.Tensor:
         """The logit [B] that the episode is over, from OutcomeLogits.known and the vitals [B, V] after the step."""
         spans = constant(torch.tensor, known.device, self.config.spans)
-        used_up = 4.0 * (vitals <= 0)  # large, so that it is learned from few ends
+        used_up = 4.0 * (vitals[:, : len(self.changed)] <= 0)  # large, so that it is learned from few ends
         return self.ending(torch.cat([known, vitals / spans, used_up], 1))[:, 0]
 
     def forward(
@@ -225,19 +228,13 @@ class FrameOutcome(nn.Module):
         reward = (read.reward.float().softmax(1) * self.rewards).sum(1)
         changes = []
         for column, (logits, values) in enumerate(zip(read.changes, self.config.changes)):
-            if is_regressed(values):
-                changes.append(values[0] * logits[:, 0].float())
-                continue
             levels, likely = constant(torch.tensor, logits.device, values), logits.float().softmax(1)
             picked = logits.argmax(1) if chances is None else chance.chosen(chances[CHANGES + column], likely)
             changes.append(levels[picked])
+        if self.regressed is not None:
+            changes += (read.numbers.float() * constant(torch.tensor, vitals.device, self.config.sizes)).unbind(1)
         left = vitals.float() + torch.stack(changes, 1) if changes else vitals
         return OutcomePrediction(reward, self.ends(read.known, left).float(), left, read.hidden.float())
-
-
-def is_regressed(levels: tuple[float, ...]) -> bool:
-    """Whether a vital with these `changes` changes by any amount."""
-    return len(levels) == 1
 
 
 def _numbers(count: int) -> spaces.Box:

@@ -182,6 +182,10 @@ class Outcome(WorldPart, Protocol):
     begins: tuple[float, ...]
 
     @property
+    def vectors(self) -> tuple[str, ...]:
+        """Channels of several numbers that it predicts."""
+
+    @property
     def draws(self) -> Mapping[int, Sequence[int]]:
         """The shapes of the random numbers of a step, by their streams."""
 

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 
 from ...data import ClipCache
-from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits, is_regressed
+from ...worlds.outcome import FrameOutcome, OutcomeConfig, OutcomeLogits
 from ..feeds import RandomBatches
 from ..learners import Learner, warmup_cosine
 from ..sized_feed import SizedFeed
@@ -26,7 +26,7 @@ _LEVELS = 33  # values at most into which rewards and changes are discretised
 class Happenings:
     """The outcomes of the steps of a recording: action encoded for networks [N, A]; reward [N]; done [N]; vitals [N, V] before the
     step; change [N, V] of the vitals; real bool [N]: whether the step was recorded and may be trained on; names [V]: the channel of
-    each vital; vectors: those of them that change by any amount."""
+    each vital; vectors: those of vectors, which come last."""
 
     action: np.ndarray
     reward: np.ndarray
@@ -40,7 +40,7 @@ class Happenings:
     @staticmethod
     def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray, vectors: Sequence[str] = ()) -> Happenings:
         """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see; `vectors`: channels whose
-        numbers are vitals, too."""
+        numbers are vitals, too, the last."""
         chosen = cache.vitals | {name: cache.further[name] for name in vectors}
         columns = {name: np.asarray(array, np.float32).reshape(cache.length, -1) for name, array in chosen.items()}
         names = tuple(name for name, array in columns.items() for _ in range(array.shape[1]))
@@ -68,15 +68,14 @@ class Happenings:
 
     def config(self, cameras: int = 1) -> OutcomeConfig:
         """Of frames in which the pictures of this many cameras lie side by side."""
-        changes = tuple(
-            (float(np.sqrt(np.square(of).mean())) or 1.0,) if name in self.vectors else levels(of)
-            for name, of in zip(self.names, self.change[self.real].T)
-        )
         before, change = self.vitals[self.real], self.change[self.real]
+        single = sum(name not in self.vectors for name in self.names)
+        changes = tuple(levels(of) for of in change[:, :single].T)
+        sizes = tuple(float(size) or 1.0 for size in np.sqrt(np.square(change[:, single:]).mean(0)))
         largest = np.maximum(np.abs(before), np.abs(before + change)).max(0, initial=0)  # some change at the end alone
         spans = tuple(float(span) or 1.0 for span in largest)
         rewards, side = levels(self.reward[self.real]), OutcomeConfig.side * cameras
-        return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, spans, side=side)
+        return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, sizes, spans, side=side)
 
 
 def levels(values: np.ndarray) -> tuple[float, ...]:
@@ -119,8 +118,7 @@ class OutcomeObjective:
         eventful = (sums[self.starts + LENGTH] - sums[self.starts]).astype(float)
         self.even = np.full(len(self.starts), 1 / max(1, len(self.starts)))
         self.often = 0.5 * self.even + 0.5 * (eventful / eventful.sum() if eventful.any() else self.even)
-        changed = [head for head, usual in zip(outcome.changed, outcome.config.changes) if not is_regressed(usual)]
-        heads = [weight for head in (outcome.paid, outcome.ending, *changed) for weight in head.parameters()]
+        heads = [weight for head in (outcome.paid, outcome.ending, *outcome.changed) for weight in head.parameters()]
         known = {id(weight) for weight in heads}
         body = [weight for weight in outcome.parameters() if id(weight) not in known]
         groups = [{"params": body}, {"params": heads, "pace": 8.0}]  # only the heads learn from rare events at first
@@ -162,13 +160,12 @@ class OutcomeObjective:
         """Changes [B, V] of the vitals, drawn from what is predicted."""
         drawn = [predicted.hidden.new_zeros(len(predicted.hidden), 0)]
         for logits, values in zip(predicted.changes, self.outcome.config.changes):
-            if is_regressed(values):
-                drawn.append(values[0] * logits.detach())
-                continue
             upto = logits.detach().float().softmax(1).cumsum(1)
             pick = (upto < now.rand(len(upto), 1)).sum(1, keepdim=True).clamp_max(len(values) - 1)
             drawn.append(torch.tensor(values, device=upto.device)[pick])
-        return torch.cat(drawn, 1)
+        return torch.cat(
+            [*drawn, predicted.numbers.detach() * predicted.numbers.new_tensor(self.outcome.config.sizes)], 1
+        )
 
 
 def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:
@@ -190,15 +187,15 @@ def negative_log_likelihood(
     done: torch.Tensor,
     change: torch.Tensor,
 ) -> torch.Tensor:
-    """[B], in nats (of vectors Huber's loss), of recorded reward [B], done [B], change [B, V]; ends [B]: logit of termination."""
+    """[B], in nats (of vectors the mean of Huber's loss), of recorded reward [B], done [B] and change [B, V]. ends [B]: a logit."""
     total = F.cross_entropy(predicted.reward, two_hot(reward, torch.tensor(config.rewards)), reduction="none")
     total = total + F.binary_cross_entropy_with_logits(ends, done, reduction="none")
     for column, (logits, values) in enumerate(zip(predicted.changes, config.changes)):
-        if is_regressed(values):
-            total = total + F.huber_loss(logits[:, 0], change[:, column] / values[0], reduction="none")
-            continue
         right = two_hot(change[:, column], torch.tensor(values))
         total = total + F.cross_entropy(logits, right, reduction="none")
+    if config.sizes:
+        numbers = change[:, len(config.changes) :] / change.new_tensor(config.sizes)
+        total = total + F.huber_loss(predicted.numbers, numbers, reduction="none").mean(1)
     return total
 
 

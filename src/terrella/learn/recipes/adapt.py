@@ -12,10 +12,10 @@ from ...worlds.folder import load_latent
 from ...worlds.latent import LatentWorld
 from ...worlds.learned import LearnedWorld
 from ..latent_validation import ARMS, HORIZONS, open_loop
-from ..recording import Recording, vectors_of
+from ..recording import Recording
 from ..trainer import Report
 from .adapt_frames import adapt_frames, settings_of
-from .latent import Beginning, LatentTraining, open_rows, train_latent
+from .latent import Beginning, LatentTraining, open_rows, train_latent, vectors_of
 
 LATENT_RATE, FRAMES_RATE, PLACES_RATE = 5e-4, 3e-3, 4e-4  # peak learning rates
 

@@ -75,7 +75,7 @@ def settings_of(world: LearnedWorld) -> TrainConfig:
     frames = 0 if isinstance(world.uncertainty, NoUncertainty) else TrainConfig.uncertainty_frames
     settings = TrainConfig(
         world.spec.name, shape.size, shape.geometry, drawn.channels, frames=drawn.slots, flow_steps=drawn.steps,
-        uncertainty_frames=frames, compile=False,
+        uncertainty_frames=frames, compile=False, predict=world.outcome.vectors,
     )  # fmt: skip
     if not shape.geometry:
         return settings

@@ -13,6 +13,7 @@ import torch
 from ...core.errors import DatasetError, TrainingError
 from ...core.spec import kind_of
 from ...data import Clips, ClipsConfig, Dataset
+from ...data.channels import usually_seen
 from ...worlds.checkpoint import WORLD_FILE
 from ...worlds.folder import save_latent, with_saved_keys
 from ...worlds.latent import LatentWorld
@@ -25,7 +26,7 @@ from ..objectives.latent_prediction import LatentPrediction, latent_clips, param
 from ..objectives.lawful import LawLoss
 from ..objectives.outcome import levels
 from ..paired import fingerprint
-from ..recording import Recording, vectors_of
+from ..recording import Recording
 from ..rehearsal import Rehearsal
 from ..sized_feed import Feed, SizedFeed
 from ..strips import write_lines
@@ -33,9 +34,13 @@ from ..trainer import Paced, Report, Run, Trainer
 
 STAGE = "latent"
 SIDE, COARSE = 64, 16  # pixels: the longer side at most, and of what sides are multiples
+WIDEST = 512  # numbers of a channel at most, to be treated as a vector
 LATENT_WIDEST = 64  # numbers of all vectors at most, to be the latent themselves
 STARTS = 64
 LEAP = 5  # steps at once, by default
+NO_VECTORS = frozenset(
+    "rgb depth reward done done_probability uncertainty known keyframes mosaic instruction latent".split()
+)  # kinds of channels that are not learned as vectors
 WHY = "a latent world is learned from actions and observations (`terrella train latent-actions` finds actions in pictures)"
 
 
@@ -140,6 +145,28 @@ def fitted_size(dataset: Dataset) -> tuple[int, int]:
     share = min(1.0, SIDE / max(sides))
     height, width = (max(COARSE, COARSE * round(share * side / COARSE)) for side in sides)
     return height, width
+
+
+def vectors_of(recording: Recording, wanted: tuple[str, ...] = ()) -> tuple[tuple[str, int], ...]:
+    """(channel, width) of the vectors of a recording, such as state, pose and vitals: those usually seen, or those in `wanted`."""
+    cache, widths = recording.cache, {}
+    for channel, key in cache.keys.items():
+        array = cache.arrays.get(key)
+        if (
+            array is None
+            or kind_of(channel) in NO_VECTORS
+            or key in ("action", "action_valid", "task")
+            or array.ndim > 2
+        ):
+            continue
+        if (width := int(np.prod(array.shape[1:]))) <= WIDEST:
+            widths[channel] = width
+    if lacks := [name for name in wanted if name not in widths]:
+        raise DatasetError(
+            f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(sorted(widths)) or 'none'}."
+        )
+    chosen = wanted or [name for name in widths if usually_seen(name)]
+    return tuple((name, width) for name, width in sorted(widths.items()) if name in chosen)
 
 
 def _has_ends(recording: Recording) -> bool:

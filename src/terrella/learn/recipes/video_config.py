@@ -32,7 +32,7 @@ class TrainConfig:
     half: bool = True  # --no-half: compute in float32 where the device computes bfloat16.
     frames: int = 4  # Number of past frames that a world without geometry sees.
     # Vectors of the recording, such as the place of a hand, that the world predicts beside its frames, so that policies that see
-    # them can act in it. Numbers that stand alone, such as health, are always predicted.
+    # them can act in it. For worlds of frames alone, which predict single numbers, such as health, anyway.
     predict: tuple[str, ...] = ()
     # Training steps of the model that predicts reward, termination, vitals and --predict.
     outcome_steps: int = 1500

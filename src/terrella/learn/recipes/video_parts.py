@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from torch import nn
 
+from ...core.errors import DatasetError, TrainingError
 from ...worlds.config import VideoConfig
 from ...worlds.folder import with_saved_keys
 from ...worlds.learned import About, LearnedWorld
@@ -19,10 +20,12 @@ from ..objectives.flow import Flow
 from ..objectives.flow_frames import FlowFrames
 from ..objectives.outcome import Happenings, OutcomeObjective, learn_outcome
 from ..presets import TrainingPlan
-from ..recording import Recording, vectors_of
+from ..recording import Recording
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
 from .video_config import TrainConfig
+
+WIDEST = 64  # numbers of a vector that is predicted, at most
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ class VideoParts:
     def __init__(self, run: Run, recording: Recording, config: TrainConfig, video: VideoConfig):
         self.run, self.recording, self.config = run, recording, config
         self.facts: dict = {}  # of the stages so far, for the world's card
-        vectors = [name for name, _ in vectors_of(recording, config.predict)] if config.predict else []
+        vectors = vectors_to_predict(recording, config.predict, video)
         self.happened = Happenings.of(recording.cache, recording.action(slice(None)).numpy(), recording.usable, vectors)
         self.outcome: FrameOutcome | None = None
         if self.happened.is_informative and (video.moving or not video.geometry):
@@ -132,6 +135,17 @@ class VideoParts:
             "parameters": sum(weight.numel() for module in modules for weight in module.parameters()),
             **self.facts,
         }
+
+
+def vectors_to_predict(recording: Recording, wanted: Sequence[str], video: VideoConfig) -> tuple[str, ...]:
+    """The vectors that are wanted beside the vitals. DatasetError for names of none, TrainingError for a world with geometry."""
+    if wanted and video.geometry:
+        raise TrainingError("--predict is for worlds of frames alone; add --no-geometry, or leave it out.")
+    further, vitals = recording.cache.further, recording.cache.vitals
+    known = [name for name, array in further.items() if array.ndim == 2 and array.shape[1] <= WIDEST]
+    if lacks := [name for name in wanted if name not in known and name not in vitals]:
+        raise DatasetError(f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(known) or 'none'}.")
+    return tuple(name for name in dict.fromkeys(wanted) if name not in vitals)
 
 
 def _first_vitals(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:
