@@ -88,7 +88,7 @@ def test_it_learns_the_other_camera_and_forgets_less_where_it_rehearses(made, tm
     world, many = load_world(tmp_path / "old" / "world"), replace(FEW, steps=200)
     alone = adapt(world, new, tmp_path / "alone", many, quiet)["errors"]["new"]
     both = adapt(world, new, tmp_path / "both", many, quiet, old)["errors"]
-    assert alone["after"]["8"] < 0.7 * alone["before"]["8"]
+    assert alone["after"]["8"] < 0.75 * alone["before"]["8"]
     assert both["new"]["after"]["8"] < 0.8 * alone["before"]["8"], "every second batch is of the old one"
     forgotten = frame_errors(load_world(tmp_path / "alone" / "world"), _fitting(world, old, quiet))["8"]
     assert both["old"]["after"]["8"] < forgotten
