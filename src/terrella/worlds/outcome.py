@@ -77,11 +77,11 @@ class OutcomeConfig:
     changes: tuple[
         tuple[float, ...], ...
     ] = ()  # of each vital that is no vector's the changes that a step may bring, ascending
-    sizes: tuple[float, ...] = ()  # of each number of vectors the usual size of its change
     spans: tuple[float, ...] = ()  # of each vital its usual size
     hidden: int = 64  # width of the GRU
     side: int = 64  # pixels; larger frames are shrunk to it
     begins: tuple[float, ...] = ()  # vitals of a new episode
+    sizes: tuple[float, ...] = ()  # of each number of vectors the usual size of its change
 
 
 class OutcomePrediction(NamedTuple):

@@ -75,7 +75,7 @@ class Happenings:
         largest = np.maximum(np.abs(before), np.abs(before + change)).max(0, initial=0)  # some change at the end alone
         spans = tuple(float(span) or 1.0 for span in largest)
         rewards, side = levels(self.reward[self.real]), OutcomeConfig.side * cameras
-        return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, sizes, spans, side=side)
+        return OutcomeConfig(self.action.shape[1], rewards, self.names, changes, spans, side=side, sizes=sizes)
 
 
 def levels(values: np.ndarray) -> tuple[float, ...]:
