@@ -118,7 +118,7 @@ def test_levels_and_shares_are_those_of_the_recording(learned):
 
 def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
     cache, seen, happened, _ = learned
-    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, ["place"])
+    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, {"place": cache.further["place"]})
     assert both.names == ("lives", "place", "place") and happened.names == ("lives",)
     assert np.array_equal(both.vitals[:, 2], 2 * both.vitals[:, 1]) and both.vitals[:, 1].max() == 5
     config = both.config()
@@ -138,7 +138,7 @@ def test_the_numbers_of_a_vector_are_predicted_beside_the_vitals(learned):
 
 def test_vectors_are_read_off_episodes_that_it_never_saw(learned, tmp_path):
     cache, seen, _, _ = learned
-    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, ["place"])
+    both = Happenings.of(cache, seen.action(slice(None)).numpy(), seen.usable, {"place": cache.further["place"]})
     torch.manual_seed(0)
     outcome = FrameOutcome(both.config())
     learn_outcome(Run(tmp_path, {}, quiet), OutcomeObjective(outcome, seen.rgb, both, 6, 5e-3), 120)
@@ -241,6 +241,17 @@ def test_a_vector_that_no_recording_has_is_refused(recording, tmp_path):
         train_video(recording, tmp_path, TrainConfig(size=SIZE, predict=("hand", "place", "drifted")), quiet)
     with pytest.raises(TrainingError, match="add --no-geometry"):
         vectors_to_predict(Recording.open(recording, SIZE, quiet), ("place",), VideoConfig((1.0, 1.0, 0.5, 0.5), 3))
+
+
+def test_the_state_of_a_gymnasium_environment_is_a_vector_too(tmp_path):
+    layout = layout_of(15.0, ("action_0",), rgb=SIZE, vectors={"state": 3}, world=FACTS)
+    with Recorder(tmp_path / "set", layout) as recorder:
+        for row in range(80):
+            recorder.add({"rgb": picture(row % 6), "state": np.full(3, row, np.float32)}, np.array([1]), 0.0, False)
+        recorder.end_episode()
+    video = VideoConfig((1.0, 1.0, 0.5, 0.5), 3, SIZE, geometry=False)
+    vectors = vectors_to_predict(Recording.open(tmp_path / "set", SIZE, quiet), ("state",), video)
+    assert {name: array.shape[1] for name, array in vectors.items()} == {"state": 3}
 
 
 def test_a_dream_pays_costs_lives_and_ends(learned):

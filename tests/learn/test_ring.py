@@ -39,10 +39,8 @@ class Carousel:
     """Three cameras on a disc that an action turns, in a round room of colours that change smoothly with the direction."""
 
     def __init__(self, turns: float = 0.3, rolls: float = 0.0):
-        self.turns, self.rolls = (
-            turns,
-            rolls,
-        )  # radians of an action by which the disc turns, and of its heading the left camera
+        self.turns = turns  # radians of an action by which the disc turns
+        self.rolls = rolls  # the part of its heading by which the left camera turns, too
         channels = {name: spaces.Box(0, 255, (*SIZE, 3), np.uint8) for name in YAWS}
         channels |= {name.replace("rgb", "pose"): POSE for name in YAWS} | {"reward": REWARD}
         cameras = {name: Camera(FIELD, SIZE, name.replace("rgb", "pose")) for name in YAWS}

@@ -74,9 +74,7 @@ class OutcomeConfig:
     rewards: tuple[float, ...]  # values of the two-hot code of rewards, ascending
     # Channels of the player's numbers, such as "health"; then those of vectors, each once for each of its numbers.
     vitals: tuple[str, ...] = ()
-    changes: tuple[
-        tuple[float, ...], ...
-    ] = ()  # of each vital that is no vector's the changes that a step may bring, ascending
+    changes: tuple[tuple[float, ...], ...] = ()  # of each other vital the changes that a step may bring, ascending
     spans: tuple[float, ...] = ()  # of each vital its usual size
     hidden: int = 64  # width of the GRU
     side: int = 64  # pixels; larger frames are shrunk to it

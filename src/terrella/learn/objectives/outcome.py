@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,10 +38,12 @@ class Happenings:
     vectors: tuple[str, ...] = ()
 
     @staticmethod
-    def of(cache: ClipCache, action: np.ndarray, usable: np.ndarray, vectors: Sequence[str] = ()) -> Happenings:
-        """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see; `vectors`: channels whose
-        numbers are vitals, too, the last."""
-        chosen = cache.vitals | {name: cache.further[name] for name in vectors}
+    def of(
+        cache: ClipCache, action: np.ndarray, usable: np.ndarray, vectors: Mapping[str, np.ndarray] = {}
+    ) -> Happenings:
+        """`action`: float [N, A] encoded for networks; `usable`: bool [N], rows that training may see; `vectors`: channels
+        [N, D] whose numbers are vitals, too, the last."""
+        chosen = cache.vitals | dict(vectors)
         columns = {name: np.asarray(array, np.float32).reshape(cache.length, -1) for name, array in chosen.items()}
         names = tuple(name for name, array in columns.items() for _ in range(array.shape[1]))
         vitals = np.concatenate([np.zeros((cache.length, 0), np.float32), *columns.values()], 1)
@@ -163,9 +165,8 @@ class OutcomeObjective:
             upto = logits.detach().float().softmax(1).cumsum(1)
             pick = (upto < now.rand(len(upto), 1)).sum(1, keepdim=True).clamp_max(len(values) - 1)
             drawn.append(torch.tensor(values, device=upto.device)[pick])
-        return torch.cat(
-            [*drawn, predicted.numbers.detach() * predicted.numbers.new_tensor(self.outcome.config.sizes)], 1
-        )
+        sizes = predicted.numbers.new_tensor(self.outcome.config.sizes)
+        return torch.cat([*drawn, predicted.numbers.detach() * sizes], 1)
 
 
 def learn_outcome(run: Run, objective: OutcomeObjective, steps: int) -> dict:

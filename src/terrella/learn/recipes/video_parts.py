@@ -23,9 +23,8 @@ from ..presets import TrainingPlan
 from ..recording import Recording
 from ..sized_feed import Feed
 from ..trainer import Run, Trainer
+from .latent import vectors_of
 from .video_config import TrainConfig
-
-WIDEST = 64  # numbers of a vector that is predicted, at most
 
 
 @dataclass(frozen=True)
@@ -137,15 +136,17 @@ class VideoParts:
         }
 
 
-def vectors_to_predict(recording: Recording, wanted: Sequence[str], video: VideoConfig) -> tuple[str, ...]:
-    """The vectors that are wanted beside the vitals. DatasetError for names of none, TrainingError for a world with geometry."""
-    if wanted and video.geometry:
+def vectors_to_predict(recording: Recording, wanted: Sequence[str], video: VideoConfig) -> dict[str, np.ndarray]:
+    """The vectors [N, D] that are wanted beside the vitals. DatasetError for names of none, TrainingError for a world with
+    geometry."""
+    if not wanted:
+        return {}
+    if video.geometry:
         raise TrainingError("--predict is for worlds of frames alone; add --no-geometry, or leave it out.")
-    further, vitals = recording.cache.further, recording.cache.vitals
-    known = [name for name, array in further.items() if array.ndim == 2 and array.shape[1] <= WIDEST]
-    if lacks := [name for name in wanted if name not in known and name not in vitals]:
+    cache, known = recording.cache, dict(vectors_of(recording))
+    if lacks := [name for name in wanted if name not in known and name not in cache.vitals]:
         raise DatasetError(f"{recording.name} has no vector {', '.join(lacks)}; it has {', '.join(known) or 'none'}.")
-    return tuple(name for name in dict.fromkeys(wanted) if name not in vitals)
+    return {name: cache.arrays[cache.keys[name]] for name in wanted if known.get(name, 1) > 1}
 
 
 def _first_vitals(vitals: np.ndarray, recording: Recording) -> tuple[float, ...]:
