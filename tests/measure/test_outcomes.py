@@ -1,4 +1,4 @@
-"""Fates: errors of reward, health and end are what they should be for worlds that are right, blind, or always wrong."""
+"""Outcomes: errors of reward, health and end are what they should be for worlds that are right, blind, or always wrong."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from terrella.core import Spec, State, make_rng
 from terrella.core.errors import DatasetError
 from terrella.core.spec import DONE, REWARD
 from terrella.measure import CLIPS, ENDINGS, Exam, ExamConfig, examine
+from terrella.measure.clips import Clip
 from terrella.measure.outcomes import auc, clips_with_endings, correlation, outcome_rows
+from terrella.measure.rollouts import StepMetric, dream
+from terrella.measure.scorecard import EARLY, PREDICTED
 
 HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -123,6 +126,46 @@ def test_nothing_but_the_end_is_judged_after_an_end():
     ]
     assert len(rows) == 4 and all(row.figure.value == 0 for row in rows)
     assert min(row.figure.count for row in rows if row.what == "error") < 24
+
+
+def test_the_share_of_stretches_that_end_too_early():
+    clips, real = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
+    exam = Exam({"right": Game()}, {CLIPS: {"recorded": clips}}, ExamConfig((4, 16), ()))
+    going = torch.from_numpy(np.stack(real))
+    right = torch.from_numpy(np.stack([clip.channels["done"][4:-1] for clip in clips])).bool().reshape(24, 16)
+    early = right.clone()
+    early[0, 2:], early[1, 7:] = True, True
+
+    def shares(done) -> list[float]:
+        rows = outcome_rows(exam, "recorded", "right", clips, going, {"done": done})
+        return [row.figure.value for row in rows if row.what == EARLY]
+
+    assert real[0][4:8].all() and real[1][4:13].all(), "the stretches go on for longer"
+    assert shares(right) == [0, 0] and shares(early) == [1 / 24, 2 / 24]
+
+
+class Walk:
+    """A number that grows by one each step until it is 3: then the world says that it is over, and stands still."""
+
+    spec = Spec("walk", spaces.MultiBinary(1), {"reward": REWARD}, ("reward",), 0.1)
+
+    def observe(self, observation, prior, rng) -> State:
+        place = observation["reward"].float()
+        return State({"place": place, "done": place > 9})
+
+    def imagine(self, state, action, rng) -> State:
+        place = torch.where(state["done"], state["place"], state["place"] + 1)
+        return State({"place": place, "done": place >= 3})
+
+    def render(self, state, channels):
+        return {"reward": state["place"]}
+
+
+@pytest.mark.parametrize("ends, places", [(False, [1, 2, 3, 4, 5, 6]), (True, [1, 2, 3, 3, 3, 3])])
+def test_a_rollout_goes_on_after_a_predicted_end_unless_the_end_is_judged(ends, places):
+    clip = Clip({"reward": np.zeros(7, np.float32)}, np.zeros((7, 1), np.float32), 1, 0, 0)
+    metric = StepMetric(("reward",), lambda seen, *_: {"place": seen["reward"]}, ends)
+    assert dream(Walk(), [clip], PREDICTED, 6, make_rng(0), [metric])["place"].tolist() == [places]
 
 
 def test_results_of_another_recording_do_not_count():

@@ -72,6 +72,12 @@ class Leaping(World, Protocol):
         ...
 
 
+def going_on(state: State) -> State:
+    """The state of an episode that is not over, whatever a world predicts. A recording that goes on is compared with it: after an
+    end that was predicted too early, pictures would stand still."""
+    return state.replace(done=torch.zeros_like(state["done"])) if "done" in state else state
+
+
 def make_rng(seed: int, device: str = "cpu") -> torch.Generator:
     """A seeded generator for the verbs."""
     return torch.Generator(device=device).manual_seed(seed)

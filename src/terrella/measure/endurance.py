@@ -11,7 +11,7 @@ import torch
 
 from ..core.policy import Idle, Policy, Replay
 from ..core.spec import can_idle
-from ..core.world import World
+from ..core.world import World, going_on
 from .album import Album, appearance
 from .clips import Clip
 from .exam import Exam, ExamResults, Probe
@@ -79,7 +79,7 @@ def long_rollout(
     looks, poses, frames = [], [], [last[0]]
     for step in range(1, steps + 1):
         action, memory = policy.act({}, memory, rng)
-        state = world.imagine(state, action, rng)
+        state = world.imagine(going_on(state), action, rng)
         if step == 1 or step % STRIDE == 0:
             seen = {name: tensor.cpu() for name, tensor in world.render(state, ("rgb", "pose")[: 1 + posed]).items()}
             if step % STRIDE == 0:

@@ -22,7 +22,7 @@ from .scorecard import IDLE, OTHERS, PREDICTED, TRUE, ProbeReport, place_label
 from .work_units import Unit
 
 CLIPS, LONG, ENDINGS = "clips", "long", "endings"  # sets of clips: for figures, for drift, with ends of episodes
-STORE_VERSION = 4  # of stored results; those of another version are measured again
+STORE_VERSION = 5  # of stored results; those of another version are measured again
 
 
 @dataclass(frozen=True)

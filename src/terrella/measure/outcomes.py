@@ -12,14 +12,15 @@ from ..core.world import World
 from .clips import Clip, Where, recorded_channels, runs
 from .exam import ENDINGS, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric
-from .scorecard import COPY_LAST, PREDICTED, ProbeReport, Row
-from .statistics import Figure, mean_interval
+from .scorecard import COPY_LAST, EARLY, PREDICTED, ProbeReport, Row
+from .statistics import Figure, mean_interval, wilson
 
 LEAD = (
     "Predictions of reward, of numbers such as health, and of the end: the mean absolute error of the return over the steps, and "
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
-    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance). Half of the stretches are from "
-    "shortly before an end, if there are ends."
+    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance); and the share of stretches that "
+    "the world ends before the recording does. Half of the stretches are from shortly before an end, if there are ends. Pictures are "
+    "compared as if no end were predicted."
 )
 USUAL = "the usual reward"
 
@@ -85,6 +86,8 @@ def outcome_rows(
             note = f"{int(ended.sum())} of {len(shown)} stretches ended"
             figure = _plain(auc(dreamt["done"][:, :step].double().sum(1), ended), len(shown))
             rows.append(Row("outcomes", "done", "ends: AUC", "", *tail, figure, 1, note=note))
+            early = (dreamt["done"][:, :step].bool() & live & ~truth["done"][:, part].bool()).any(1)
+            rows.append(Row("outcomes", "done", EARLY, "", *tail, wilson(int(early.sum()), len(shown)), -1))
         reached = live[:, -1]  # episodes that last until this step
         for name in (name for name in dreamt if name not in ("reward", "done") and reached.any()):
             now, then = truth[name][reached, context - 1], truth[name][reached, context - 1 + step]
@@ -130,7 +133,7 @@ def _compared(exam: Exam, world: World) -> list[str]:
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
     names = _compared(exam, world) if of == ENDINGS else []
     flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
-    return [StepMetric(tuple(names), flat)] if names else []
+    return [StepMetric(tuple(names), flat, ends=True)] if names else []
 
 
 def _report(exam: Exam, results: ExamResults) -> ProbeReport:

@@ -13,7 +13,7 @@ import torch
 from ..core.policy import Policy, Random, act
 from ..core.spec import chance_error, measured_trust, trust_level
 from ..core.state import State
-from ..core.world import World, make_rng
+from ..core.world import World, going_on, make_rng
 from .clips import Clip, evidence
 from .exam import CLIPS, LONG, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric, rows_at
@@ -72,7 +72,7 @@ def forecast_trust(
     memory, expected = policy.begin(state.batch, rng), []
     for _ in range(limit):
         action, memory = act(policy, {}, memory, state.batch, world.spec, rng)
-        state = world.imagine(state, action, rng)
+        state = world.imagine(going_on(state), action, rng)
         expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float().mean()))
     if limit > 1 and max(expected) == min(expected):
         return None

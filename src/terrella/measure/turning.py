@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 from ..core.spec import Spec
-from ..core.world import World
+from ..core.world import World, going_on
 from ..space.camera import yaw
 from ..space.matching import scroll_index
 from .clips import Clip
@@ -55,7 +55,9 @@ def scrolling_actions(
     for _, action in candidates:
         state, frames = first, []
         for step in range(TRIAL_STEPS + 1):
-            state = state if step == 0 else world.imagine(state, action.expand(len(clips), *action.shape), rng)
+            state = (
+                state if step == 0 else world.imagine(going_on(state), action.expand(len(clips), *action.shape), rng)
+            )
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
         scrolls = [moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]
         steps = torch.stack(scrolls).float().sum(0) / TRIAL_STEPS
@@ -98,7 +100,7 @@ def _turn_rates_by_trial(
     for action in actions:
         state = first
         for _ in range(TRIAL_STEPS):
-            state = world.imagine(state, action.expand(1, *action.shape), rng)
+            state = world.imagine(going_on(state), action.expand(1, *action.shape), rng)
         seen = [world.render(each, ("pose",))["pose"].float().cpu() for each in (first, state)]
         turned.append(_angle(yaw(seen[1]) - yaw(seen[0]))[0] / TRIAL_STEPS)
     return torch.stack(turned)

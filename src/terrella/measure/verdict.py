@@ -8,13 +8,14 @@ from itertools import groupby
 from typing import Any
 
 from .endurance import COLOUR_WITHIN, SHARP_WITHIN
-from .scorecard import CHANGE, COPY_LAST, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, place_label
+from .scorecard import CHANGE, COPY_LAST, EARLY, GAIN, OTHERS, POOLED, PREDICTED, Curve, Row, Scorecard, place_label
 from .statistics import Figure
 
 BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
 REMEMBERED_DB = 25.0  # PSNR of the first picture on return, from which a world remembers
 RATIO_RANGE = 0.7, 1.3  # of sharpness and change per step, predicted over recorded
 BLUR_STEPS = 32
+EARLY_SHARE = 0.2  # of stretches that a world may end too early
 
 
 def to_json(card: Scorecard) -> str:
@@ -142,12 +143,15 @@ def _traits(card: Scorecard, arm: str) -> Iterable[str]:
     control = [row for row in mine if row.probe == "control" and row.what.endswith(f"true actions over {OTHERS}")]
     control = [row for row in control if row.what.startswith(POOLED)] or control
     closed = [row for row in mine if row.probe == "memory" and not row.what.endswith("far view again")]
+    early = [row for row in mine if row.what == EARLY]
+    early = [row for row in early if row.horizon == early[-1].horizon]
     questions = (
         (_first(control), lambda row: _sure(row, 0, math.inf, "obeys", "does not clearly obey", "disobeys")),
         (closed, lambda row: _sure(row, REMEMBERED_DB, math.inf, "remembers", "does not surely remember", "forgets")),
         (_first([row for row in sharp if row.horizon == reach]), _sharpness),
         (_first([row for row in change if row.horizon == reach]), _moves),
         ([row for row in mine if row.probe == "stillness"], _stands),
+        (early if any(_ends(row)[0] for row in early) else [], _ends),
     )
     for rows, say in questions:
         if rows:
@@ -180,6 +184,11 @@ def _sharpness(row: Row) -> tuple[int, str]:
 def _moves(row: Row) -> tuple[int, str]:
     much = "little" if row.figure.value < 1 else "much"
     return _sure(row, *RATIO_RANGE, "moves as much as the recording", f"may move too {much}", f"moves too {much}")
+
+
+def _ends(row: Row) -> tuple[int, str]:
+    rank = int(row.figure.value > EARLY_SHARE) + int(row.figure.low > EARLY_SHARE)
+    return rank, ("ends in time", "may end too early", "ends too early")[rank]
 
 
 def _stands(row: Row) -> tuple[int, str]:
