@@ -19,8 +19,8 @@ LEAD = (
     "Predictions of reward, of numbers such as health, and of the end: the mean absolute error of the return over the steps, and "
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
     "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance); and the share of stretches that "
-    "the world ends before the recording does. Half of the stretches are from shortly before an end, if there are ends. Pictures are "
-    "compared as if no end were predicted."
+    "the world ends before the recording does. Half of the stretches are from shortly before an end, if there are ends. Pictures "
+    "are compared as if no end were predicted."
 )
 USUAL = "the usual reward"
 
