@@ -15,9 +15,9 @@ from terrella.core.errors import DatasetError
 from terrella.core.spec import DONE, REWARD
 from terrella.measure import CLIPS, ENDINGS, Exam, ExamConfig, examine
 from terrella.measure.clips import Clip
-from terrella.measure.outcomes import auc, clips_with_endings, correlation, outcome_rows
+from terrella.measure.outcomes import auc, clips_with_endings, correlation, early_ends, outcome_rows
 from terrella.measure.rollouts import StepMetric, dream
-from terrella.measure.scorecard import EARLY, PREDICTED
+from terrella.measure.scorecard import PREDICTED
 
 HEALTH = spaces.Box(-np.inf, np.inf, (), np.float32)
 
@@ -128,20 +128,13 @@ def test_nothing_but_the_end_is_judged_after_an_end():
     assert min(row.figure.count for row in rows if row.what == "error") < 24
 
 
-def test_the_share_of_stretches_that_end_too_early():
-    clips, real = clips_with_endings(recording(), Game().spec, (0, 1, 2), 5, 16, 24, make_rng(0))
+def test_the_share_of_clips_that_are_ended_too_early():
+    clips, _ = clips_with_endings(recording((200,)), Game().spec, (0,), 5, 16, 4, make_rng(0))
     exam = Exam({"right": Game()}, {CLIPS: {"recorded": clips}}, ExamConfig((4, 16), ()))
-    going = torch.from_numpy(np.stack(real))
-    right = torch.from_numpy(np.stack([clip.channels["done"][4:-1] for clip in clips])).bool().reshape(24, 16)
-    early = right.clone()
-    early[0, 2:], early[1, 7:] = True, True
-
-    def shares(done) -> list[float]:
-        rows = outcome_rows(exam, "recorded", "right", clips, going, {"done": done})
-        return [row.figure.value for row in rows if row.what == EARLY]
-
-    assert real[0][4:8].all() and real[1][4:13].all(), "the stretches go on for longer"
-    assert shares(right) == [0, 0] and shares(early) == [1 / 24, 2 / 24]
+    done = torch.zeros(4, 16, dtype=torch.bool)
+    done[0, 2:4], done[1, 7], done[2, 8] = True, True, True
+    rows = early_ends(exam, "recorded", "right", {"done": done})
+    assert [(row.horizon, row.figure.value) for row in rows] == [(4, 1 / 4), (16, 3 / 4)]
 
 
 class Walk:

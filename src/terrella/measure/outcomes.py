@@ -10,7 +10,7 @@ from ..core.errors import DatasetError
 from ..core.spec import Spec, neutral_action
 from ..core.world import World
 from .clips import Clip, Where, recorded_channels, runs
-from .exam import ENDINGS, Exam, ExamResults, Probe
+from .exam import CLIPS, ENDINGS, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric
 from .scorecard import COPY_LAST, EARLY, PREDICTED, ProbeReport, Row
 from .statistics import Figure, mean_interval, wilson
@@ -18,9 +18,9 @@ from .statistics import Figure, mean_interval, wilson
 LEAD = (
     "Predictions of reward, of numbers such as health, and of the end: the mean absolute error of the return over the steps, and "
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
-    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance); and the share of stretches that "
-    "the world ends before the recording does. Half of the stretches are from shortly before an end, if there are ends. Pictures "
-    "are compared as if no end were predicted."
+    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance); Half of these stretches "
+    "are from shortly before an end, if there are ends. Ends too early: the share of the clips, none of which ends, that the world "
+    "ends; their pictures are compared as if it did not."
 )
 USUAL = "the usual reward"
 
@@ -86,8 +86,6 @@ def outcome_rows(
             note = f"{int(ended.sum())} of {len(shown)} stretches ended"
             figure = _plain(auc(dreamt["done"][:, :step].double().sum(1), ended), len(shown))
             rows.append(Row("outcomes", "done", "ends: AUC", "", *tail, figure, 1, note=note))
-            early = (dreamt["done"][:, :step].bool() & live & ~truth["done"][:, part].bool()).any(1)
-            rows.append(Row("outcomes", "done", EARLY, "", *tail, wilson(int(early.sum()), len(shown)), -1))
         reached = live[:, -1]  # episodes that last until this step
         for name in (name for name in dreamt if name not in ("reward", "done") and reached.any()):
             now, then = truth[name][reached, context - 1], truth[name][reached, context - 1 + step]
@@ -95,6 +93,16 @@ def outcome_rows(
             figures = mean_interval(error, rng()), -1, {COPY_LAST: mean_interval(copied, rng())}
             rows.append(Row("outcomes", name, "error", "", *tail, *figures, mean_interval(copied - error, rng())))
     return rows
+
+
+def early_ends(exam: Exam, place: str, arm: str, dreamt: Results) -> list[Row]:
+    """Rows of the share of clips that the world ends, of which none does. dreamt: whether each step ends it, [n, T]."""
+    done, tail = dreamt["done"].bool(), (place, arm, PREDICTED)
+    ended = {step: done[:, :step].any(1) for step in exam.config.horizons if step <= done.shape[1]}
+    return [
+        Row("outcomes", "done", EARLY, "", *tail, step, wilson(int(early.sum()), len(done)), -1)
+        for step, early in ended.items()
+    ]
 
 
 def correlation(first: torch.Tensor, second: torch.Tensor) -> Figure:
@@ -131,6 +139,8 @@ def _compared(exam: Exam, world: World) -> list[str]:
 
 
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
+    if of == CLIPS and "done" in world.spec.channels:
+        return [StepMetric(("done",), lambda seen, *_: {"done": seen["done"]})]
     names = _compared(exam, world) if of == ENDINGS else []
     flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
     return [StepMetric(tuple(names), flat, ends=True)] if names else []
@@ -141,6 +151,8 @@ def _report(exam: Exam, results: ExamResults) -> ProbeReport:
     for place, clips, arm, _, dreamt in results.dreams(exam, ENDINGS, (PREDICTED,)):
         going = torch.from_numpy(np.stack(exam.going[place]))
         whole.rows += outcome_rows(exam, place, arm, clips, going, dreamt)
+    for place, _, arm, _, dreamt in results.dreams(exam, CLIPS, (PREDICTED,)):
+        whole.rows += early_ends(exam, place, arm, dreamt) if "done" in dreamt else []
     return whole
 
 

@@ -11,7 +11,7 @@ PREDICTED, TRUE = "predicted", "true"  # motion: the world is given actions alon
 OTHERS, IDLE = "other actions", "no action"  # those of another clip; the neutral action, held
 COPY_LAST = "copy last"
 POOLED = "pooled PSNR"  # of the errors of all clips together
-EARLY = "ends too early"  # share of stretches that the world ends before the recording does
+EARLY = "ends too early"  # share of the clips, none of which ends, that the world ends
 CHANGE = "change per step"  # how many pixels change from step to step, predicted over recorded
 GAIN = ": gain over copy-last"  # suffix of a measure: the curve of the comparison at every step
 

@@ -15,7 +15,7 @@ BETTER, UNCLEAR, WORSE = "better", "no clear difference", "worse"
 REMEMBERED_DB = 25.0  # PSNR of the first picture on return, from which a world remembers
 RATIO_RANGE = 0.7, 1.3  # of sharpness and change per step, predicted over recorded
 BLUR_STEPS = 32
-EARLY_SHARE = 0.2  # of stretches that a world may end too early
+EARLY_SHARE = 0.2  # of clips that a world may end too early
 
 
 def to_json(card: Scorecard) -> str:
