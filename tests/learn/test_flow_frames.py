@@ -254,7 +254,9 @@ def test_a_teacher_is_as_much_of_the_target_as_is_said():
 
 
 def test_a_student_begins_with_channels_of_its_teacher():
-    wide, narrow = (FlowConfig((16, 16), 2, 36 + 2, 2, channels=widths) for widths in ((32, 24, 16), (16, 16, 8)))
+    wide, narrow = (
+        FlowConfig((16, 16), 2, 36 + 2, 2, channels=widths, normed=True) for widths in ((32, 24, 16), (16, 16, 8))
+    )
     torch.manual_seed(0)
     teacher, same, student = FlowNetwork(wide), FlowNetwork(wide), FlowNetwork(narrow)
     torch.nn.init.normal_(teacher.output.weight, std=0.1)

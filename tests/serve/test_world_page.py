@@ -35,9 +35,11 @@ def made(size: tuple[int, int], moves: int = 0, recalls: bool = False) -> Learne
     """A world of random weights, whose pictures change a lot."""
     torch.manual_seed(1)
     slots, actions = 3, 3
-    network = FlowNetwork(FlowConfig(size, slots, 36 + slots * actions, moves, (16, 24, 32), 3, recalls))
+    network = FlowNetwork(FlowConfig(size, slots, 36 + slots * actions, moves, (16, 24, 32), 3, recalls, normed=True))
     with torch.no_grad():
         network.output.weight.normal_(0, 0.1)
+        network.norm.weight.normal_(1, 0.2)
+        network.norm.bias.normal_(0, 0.2)
         if network.scrolling is not None:
             network.scrolling.votes.weight.normal_(0, 2)
         for weight in network.parameters():

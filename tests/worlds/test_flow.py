@@ -29,7 +29,7 @@ MOVES = torch.tensor([[0, 0], [2, 0], [0, -3]])
 def network(wild: bool = True, moves: int = 2, seed: int = 0, recalls: bool = False) -> FlowNetwork:
     torch.manual_seed(seed)
     made = (
-        FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + 2 * SLOTS, moves, (8, 16, 16), recalls=recalls))
+        FlowNetwork(FlowConfig(SIZE, SLOTS, 36 + 2 * SLOTS, moves, (8, 16, 16), recalls=recalls, normed=True))
         .eval()
         .requires_grad_(False)
     )
@@ -68,6 +68,17 @@ def world(generator: FlowNetwork, ground: torch.Tensor | None = None) -> Learned
 def test_it_keeps_the_contract(moves, recalls):
     made = world(network(moves=moves, recalls=recalls))
     assert {"batches", "states_can_be_saved"} <= set(check_world(made, steps=3))
+
+
+def test_maps_that_grow_do_not_make_pictures_grow():
+    """In a training that went on for longer they grew until the last layers answered 0, or what is not a number."""
+    made, seen = network(moves=0), shown(2)
+    usual = made.draw(noise(2, 0), seen)
+    made.after[3].second.weight.mul_(1e6)
+    made.after[3].second.bias.mul_(1e6)
+    grown = made.draw(noise(2, 0), seen)
+    assert (grown[:, :3] - usual[:, :3]).abs().max() > 0.01, "they are seen"
+    assert grown[:, :3].abs().max() < 2 * usual[:, :3].abs().max()
 
 
 def test_a_frame_of_long_ago_changes_what_is_drawn_where_it_is_like_the_draft():

@@ -59,6 +59,8 @@ def subclone(teacher: FlowNetwork, network: FlowNetwork) -> FlowNetwork:
             fill_layer(f"{name}.{level}", kept[level + 1], kept[level], gains[level])
     for number, level in ((0, 2), (1, 1)):
         fill_layer(f"up.{number}", _shuffled(kept[level - 1]), kept[level], gains[level])
+    if network.norm is not None:
+        fill_layer("norm", kept[0])
     fill_layer("detail", None, kept[0], gains[0])
     inner = _kept(_read(weights["attention.out_proj.weight"]), narrow[2], HEADS)
     three = torch.cat([inner + part * wide[2] for part in range(3)])

@@ -61,7 +61,7 @@ def _packed_network(network: FlowNetwork) -> tuple[dict[str, Any], bytes]:
         layers.append((name, *matrix.shape))
         parts += [_panels(matrix), _panels(_rows(name, bias)[None])]
     for name, vector in network.named_parameters():
-        if ".norm." in name:
+        if name.split(".")[-2:-1] == ["norm"]:
             vectors.append((name, len(vector)))
             parts.append(vector.detach())
     weights = torch.cat([part.flatten().float() for part in parts]).half().numpy().tobytes()

@@ -49,6 +49,7 @@ class FlowConfig:
     steps: int = 3  # drawing steps a frame, the draft included
     recalls: bool = False  # it sees an earlier frame that is like the draft
     views: tuple[MountedCamera, ...] = ()  # cameras whose pictures lie side by side in a frame, from the left; (): one
+    normed: bool = False  # the last layers see normalised maps; not in worlds of earlier releases
 
 
 class FlowFeatures(NamedTuple):
@@ -121,6 +122,7 @@ class FlowNetwork(nn.Module):
         self.down_drawn = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in ((fine, middle), (middle, coarse)))
         self.after = nn.ModuleList(AdaptiveBlock(width) for width in (coarse, middle, fine, fine))
         self.up = nn.ModuleList(nn.Conv2d(b, 4 * a, 1) for a, b in ((middle, coarse), (fine, middle)))
+        self.norm = nn.GroupNorm(8, fine) if config.normed else None
         self.detail = nn.Conv2d(fine, DETAIL * SQUARE**2, 1)
         self.near = nn.Conv2d(DETAIL + 9 + 4 * config.recalls, 24, 3, padding=1)
         self.output = nn.Conv2d(24, 3, 3, padding=1)
@@ -175,6 +177,7 @@ class FlowNetwork(nn.Module):
         x = after[1].modulated(middle + F.pixel_shuffle(self.up[0](x), 2), by[2])
         x = after[2].modulated(fine + F.pixel_shuffle(self.up[1](x), 2), by[3])
         x = after[3].modulated(x, by[4])
+        x = x if self.norm is None else F.silu(self.norm(x))
         height, width = self.config.size
         detail = F.pixel_shuffle(self.detail(x), SQUARE)[..., :height, :width]
         recalled = [remembered] if self.config.recalls and remembered is not None else []

@@ -112,9 +112,10 @@ class FlowRecipe:
         steps = config.flow_steps if config.flow_steps > 1 else FlowConfig.steps
         recalls = len(scrolling.moves) == 1 and comes_back(recording, config.seed)
         views = tuple(MountedCamera(lens.intrinsics, lens.mount) for lens in recording.lenses().values())
-        settings = FlowConfig(plain.size, plain.slots, plain.context, len(scrolling.moves) - 1, widths, steps, recalls)
-        mounted = len(views) == len(recording.cameras)  # it is known of each how it is mounted
-        network = FlowNetwork(replace(settings, views=views) if mounted else settings)
+        views = views if len(views) == len(recording.cameras) else ()  # where it is known of each how it is mounted
+        moves = len(scrolling.moves) - 1
+        settings = FlowConfig(plain.size, plain.slots, plain.context, moves, widths, steps, recalls, views, normed=True)
+        network = FlowNetwork(settings)
         network.moves[:], network.over[:] = scrolling.moves, scrolling.over
         return network
 

@@ -91,11 +91,26 @@ export class Network {
     return [at, at + 4 * channels];
   }
 
+  /** Maps normalised, scaled and shifted, after SiLU. */
+  normalised(name, x, pixels, channels, scale, shift) {
+    const out = this.room(`inner ${channels}`, pixels * channels);
+    this.wasm.normalise(x, pixels, channels, GROUPS, this.vector[`${name}.weight`], this.vector[`${name}.bias`], scale, shift, out);
+    return out;
+  }
+
+  /** The maps at x as the last layers see them: normalised, but in worlds of earlier releases. */
+  settled(x, pixels, channels) {
+    if (!this.vector['norm.weight']) return x;
+    const scale = this.room('ones', channels), shift = this.room('zeros', channels);
+    this.numbers(scale, channels).fill(1);
+    this.numbers(shift, channels).fill(0);
+    return this.normalised('norm', x, pixels, channels, scale, shift);
+  }
+
   /** AdaptiveBlock: changes the maps at x. */
   block(name, x, height, width, embedding) {
     const channels = this.layer[`${name}.first`].outputs, pixels = height * width;
-    const [scale, shift] = this.modulation(name, embedding), inner = this.room(`inner ${channels}`, pixels * channels);
-    this.wasm.normalise(x, pixels, channels, GROUPS, this.vector[`${name}.norm.weight`], this.vector[`${name}.norm.bias`], scale, shift, inner);
+    const inner = this.normalised(`${name}.norm`, x, pixels, channels, ...this.modulation(name, embedding));
     const first = this.apply(`${name}.first`, inner, height, width, 3, 1, 1, `first ${channels}`);
     this.wasm.silu(first, pixels * channels);
     this.wasm.add(x, this.apply(`${name}.second`, first, height, width, 3, 1, 1, `second ${channels}`), pixels * channels);
@@ -162,7 +177,7 @@ export class Network {
     });
     this.block('after.3', x, ...sizes[0], embedding);
     const detail = this.room('fine detail', tall * wide * DETAIL);
-    this.wasm.unfold(this.apply('detail', x, ...sizes[0]), ...sizes[0], SQUARE, DETAIL, detail);
+    this.wasm.unfold(this.apply('detail', this.settled(x, pixels[0], counts[0]), ...sizes[0]), ...sizes[0], SQUARE, DETAIL, detail);
     const parts = [[this.numbers(detail, tall * wide * DETAIL), DETAIL, wide], [change, 3], [base, 3], [older, 3]];
     const near = this.apply('near', this.joined('nearby', [...parts, ...(this.recalls ? memory : [])]), height, width, 3, 1, 1);
     this.wasm.silu(near, height * width * this.layer.near.outputs);
