@@ -18,7 +18,7 @@ from .statistics import Figure, mean_interval, wilson
 LEAD = (
     "Predictions of reward, of numbers such as health, and of the end: the mean absolute error of the return over the steps, and "
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
-    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance); Half of these stretches "
+    "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance). Half of these stretches "
     "are from shortly before an end, if there are ends. Ends too early: the share of the clips, none of which ends, that the world "
     "ends; their pictures are compared as if it did not."
 )
