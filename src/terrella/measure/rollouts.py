@@ -24,9 +24,7 @@ class StepMetric:
     channels: tuple[str, ...]  # to render
     # (observation, clips, row of the clips, step from 1) -> name -> [B, ...]
     measure: Callable[[Observation, Sequence[Clip], int, int], Mapping[str, torch.Tensor]]
-    ends: bool = (
-        False  # the rollout stands still after an end that the world predicts; otherwise it goes on, as the clips do
-    )
+    ends: bool = False  # the rollout stands still after an end that the world predicts; else it goes on as the clips do
 
 
 def fold_context(world: World, clips: Sequence[Clip], rng: torch.Generator) -> State:

@@ -55,9 +55,8 @@ def scrolling_actions(
     for _, action in candidates:
         state, frames = first, []
         for step in range(TRIAL_STEPS + 1):
-            state = (
-                state if step == 0 else world.imagine(going_on(state), action.expand(len(clips), *action.shape), rng)
-            )
+            if step:
+                state = world.imagine(going_on(state), action.expand(len(clips), *action.shape), rng)
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
         scrolls = [moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]
         steps = torch.stack(scrolls).float().sum(0) / TRIAL_STEPS
