@@ -25,9 +25,9 @@ from terrella.measure.closure import (
 from terrella.measure.endurance import NAMES, long_rollout, still_rows
 from terrella.measure.endurance import rows_of as stretches
 from terrella.measure.fidelity import PSNR_CAP_DB
-from terrella.measure.scorecard import GAIN, Curve
+from terrella.measure.scorecard import EARLY, GAIN, PREDICTED, Curve, Row
 from terrella.measure.speed import speed
-from terrella.measure.statistics import Band
+from terrella.measure.statistics import Band, wilson
 
 ARMS = {flaw or "perfect": Panorama(flaw) for flaw in ("", "static", "deaf", "long", "fading", "shy")}
 
@@ -100,6 +100,36 @@ def test_the_verdict_comes_first(card, clips):
     assert "blurs" in faded[0], faded
     alone = verdict(card_of({"one": Panorama()}, {"recorded": clips[:1]}))
     assert "not clearly better" in alone[0] and "no clear difference" in alone[1], "one clip cannot say"
+
+
+@pytest.mark.parametrize(
+    "shares, words",
+    [
+        ({"recorded": 4, "new": 1}, None),
+        ({"recorded": 20, "new": 20}, ", ends too early"),
+        ({"recorded": 6, "new": 1}, ", may end too early, seldom ends too early in new places"),
+        ({"recorded": 1, "new": 20}, ", seldom ends too early, ends too early in new places"),
+    ],
+)
+def test_the_verdict_names_worlds_that_end_too_early(card, shares, words):
+    rows = [
+        Row(
+            "outcomes",
+            "done",
+            EARLY,
+            "",
+            place,
+            "perfect",
+            PREDICTED,
+            step,
+            wilson(count if step == 32 else 24, 24),
+            -1,
+        )
+        for place, count in shares.items()
+        for step in (8, 32)
+    ]
+    said = verdict(replace(card, rows=[*card.rows, *rows]))[0]
+    assert (f"{words}." in said) if words else "early" not in said
 
 
 def test_the_verdict_says_at_which_steps_copying_is_better(card):

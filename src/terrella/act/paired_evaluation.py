@@ -9,7 +9,7 @@ from ..core.errors import PlanningError, TerrellaError
 from ..core.policy import Policy, observed_channels
 from ..core.spec import Spec
 from ..core.state import State
-from ..core.world import Observation, World, make_rng
+from ..core.world import Observation, World, make_rng, without_end
 from .planning import PlayedEpisode, PlaySettings, SuccessCriterion, distance, play_from
 from .planning.problem import later
 
@@ -206,7 +206,7 @@ class PairedEvaluation:
                 curves.setdefault(name, []).append(torch.where(over, torch.nan, values))
             if step < length:
                 actions = [episode.actions[min(step, episode.steps - 1)] for episode in episodes]
-                state = self.dream.imagine(state, torch.stack(actions), rng)
+                state = self.dream.imagine(without_end(state), torch.stack(actions), rng)
         return {name: torch.stack(values, 1) for name, values in curves.items()}
 
 

@@ -72,9 +72,9 @@ class Leaping(World, Protocol):
         ...
 
 
-def going_on(state: State) -> State:
-    """The state of an episode that is not over, whatever a world predicts. A recording that goes on is compared with it: after an
-    end that was predicted too early, pictures would stand still."""
+def without_end(state: State) -> State:
+    """The state of an episode that goes on, whatever the world predicts: for rollouts that are compared with a recording that goes
+    on, and for pictures over more steps than an episode has. After a predicted end a world stands still."""
     return state.replace(done=torch.zeros_like(state["done"])) if "done" in state else state
 
 

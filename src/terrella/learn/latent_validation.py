@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from ..core.errors import DatasetError
 from ..core.state import State
-from ..core.world import World, going_on, make_rng
+from ..core.world import World, make_rng, without_end
 from ..worlds.latent import FORGOTTEN, LatentWorld
 from ..worlds.latent_network import KNOTS
 from .calibration import isotonic
@@ -112,7 +112,7 @@ def open_loop(world: LatentWorld, recording: Recording, horizons: Sequence[int],
         state = state_at(world, recording, rows, context)
         for step in range(1, fitting[-1] + 1):
             state = world.imagine(
-                going_on(state), recording.recorded_actions(world.spec, actors + step - 1), make_rng(0)
+                without_end(state), recording.recorded_actions(world.spec, actors + step - 1), make_rng(0)
             )
             if step not in fitting:
                 continue
@@ -207,7 +207,7 @@ def rollout_frames(world: LatentWorld, recording: Recording, steps: int = 64) ->
     state = state_at(world, recording, rows, context)
     frames = [world.render(state, ("rgb",))["rgb"]]
     for step in range(fits[-1]):
-        state = world.imagine(going_on(state), recording.recorded_actions(world.spec, rows + step), make_rng(0))
+        state = world.imagine(without_end(state), recording.recorded_actions(world.spec, rows + step), make_rng(0))
         if (step + 1) % every == 0:
             frames.append(world.render(state, ("rgb",))["rgb"])
     return [recording.rgb(rows[0] + every * np.arange(9)), torch.cat(frames).permute(0, 3, 1, 2).cpu()]

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ..core.world import going_on, make_rng
+from ..core.world import make_rng, without_end
 from ..worlds.learned import LearnedWorld
 from ..worlds.parts import newest_frame
 from .recording import Recording
@@ -38,6 +38,6 @@ def _dream(world: LearnedWorld, recording: Recording, rows: np.ndarray) -> torch
         if config.geometry and not config.moving:  # what moves depends on actions
             state = world.observe({"pose": recording.pose([row])}, state, rng)
         else:
-            state = world.imagine(going_on(state), recording.recorded_actions(world.spec, [row - 1]), rng)
+            state = world.imagine(without_end(state), recording.recorded_actions(world.spec, [row - 1]), rng)
         frames.append(newest_frame(state))
     return torch.cat(frames)[::8].cpu()

@@ -8,7 +8,7 @@ import torch
 
 from ..core.spec import BUTTONS, CHOICE
 from ..core.state import State
-from ..core.world import World, make_rng
+from ..core.world import World, make_rng, without_end
 from .costs import EnergyMeter
 from .statistics import Figure, last_step_above
 
@@ -58,7 +58,7 @@ def _step(world: World, state: State, action: torch.Tensor, shown: Sequence[str]
 @torch.inference_mode()
 def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, seed: int = 0) -> Figure:
     """The steps up to which the world predicts the real one better than holding the first observation does, from the same starts
-    under the same random actions, in the channels that it observes."""
+    under the same random actions, in the channels that it observes. After the real end nothing is gained."""
     rng, names = make_rng(seed), list(world.spec.observes)
     truth = real.start(episodes, rng)
     first = real.render(truth, names)
@@ -66,12 +66,12 @@ def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, se
     low, high = (torch.as_tensor(limit).float() for limit in real.spec.action_limits)
     for _ in range(steps):
         action = low + (high - low) * torch.rand(episodes, *low.shape, generator=rng)
-        truth, state = real.imagine(truth, action, rng), world.imagine(state, action, rng)
+        truth, state = real.imagine(truth, action, rng), world.imagine(without_end(state), action, rng)
         seen, dreamt = real.render(truth, names), world.render(state, names)
         unit = {name: seen[name].float().std(0).clamp_min(1e-3) for name in names}
         error, held = (
             sum(((seen[name] - other[name]).float() / unit[name]).square().flatten(1).mean(1) for name in names)
             for other in (dreamt, first)
         )
-        gains.append(torch.as_tensor(held - error))
+        gains.append(torch.as_tensor(held - error).masked_fill(truth["done"].bool().cpu(), 0))
     return last_step_above(torch.stack(gains, 1), torch.zeros(episodes), rng)

@@ -10,7 +10,7 @@ import torch
 
 from ..core.errors import ObservationError
 from ..core.policy import Replay
-from ..core.world import World, going_on
+from ..core.world import World, without_end
 from .clips import Clip
 from .exam import Exam, ExamResults, Probe, batches
 from .fidelity import psnr
@@ -90,7 +90,7 @@ def run_round_trip(
     for number, step in enumerate(twice, start=1):
         if policy:
             action, memory = policy.act({}, memory, rng)
-            state = world.imagine(going_on(state), action, rng)
+            state = world.imagine(without_end(state), action, rng)
         else:
             state = world.observe({"pose": step}, state, rng)
         frames += [world.render(state, ("rgb",))["rgb"].cpu()] * looked.count(number)

@@ -11,7 +11,7 @@ import torch
 
 from ..core.policy import Idle, Policy, Replay
 from ..core.spec import can_idle
-from ..core.world import World, going_on
+from ..core.world import World, without_end
 from .album import Album, appearance
 from .clips import Clip
 from .exam import Exam, ExamResults, Probe
@@ -26,14 +26,15 @@ _DRAWN = ("sharpness", "mean of green", "spread of green")
 LEAD = (
     "Long rollouts under recorded actions, in tenths. Each frame is compared with the recorded frame nearest to the world's own "
     "pose, since a dull corner is dull in the game too; without poses, with the mean of the recordings. The table gives the tenth "
-    "that deviates most from 1, and the deviations of real stretches."
+    "that deviates most from 1, and the deviations of real stretches. They go on after ends that the world predicts."
 )
 
 
 STILL_LEAD = (
     "Rollouts without actions: sharpness and mean of each colour relative to the last true frame, all rollouts together, in the "
     "tenth that deviates most; with poses, relative to the frame in which the camera came to rest. Copying the last frame gives 1. "
-    "Only what moves by itself may change them: within 10% for sharpness and 3% for colours the picture holds."
+    "Only what moves by itself may change them: within 10% for sharpness and 3% for colours the picture holds. They go on after "
+    "ends that the world predicts, such as a fall."
 )
 GLIDES = 0.005  # deviation from the last pose, metres or quaternion, above which the camera still moves
 SHARP_WITHIN, COLOUR_WITHIN = 0.1, 0.03
@@ -79,7 +80,7 @@ def long_rollout(
     looks, poses, frames = [], [], [last[0]]
     for step in range(1, steps + 1):
         action, memory = policy.act({}, memory, rng)
-        state = world.imagine(going_on(state), action, rng)
+        state = world.imagine(without_end(state), action, rng)
         if step == 1 or step % STRIDE == 0:
             seen = {name: tensor.cpu() for name, tensor in world.render(state, ("rgb", "pose")[: 1 + posed]).items()}
             if step % STRIDE == 0:

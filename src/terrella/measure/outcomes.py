@@ -20,7 +20,7 @@ LEAD = (
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
     "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance). Half of these stretches "
     "are from shortly before an end, if there are ends. Ends too early: the share of the clips, none of which ends, that the world "
-    "ends; their pictures are compared as if it did not."
+    "ends, which even a right world does to some where ends come by chance; their pictures are compared as if it did not."
 )
 USUAL = "the usual reward"
 
@@ -139,9 +139,10 @@ def _compared(exam: Exam, world: World) -> list[str]:
 
 
 def _watch(exam: Exam, world: World, of: str, first: int) -> list[StepMetric]:
-    if of == CLIPS and "done" in world.spec.channels:
+    compared = _compared(exam, world)
+    if of == CLIPS and "done" in compared:
         return [StepMetric(("done",), lambda seen, *_: {"done": seen["done"]})]
-    names = _compared(exam, world) if of == ENDINGS else []
+    names = compared if of == ENDINGS else []
     flat = lambda seen, *_: {name: seen[name].reshape(len(seen[name])).float() for name in names}  # noqa: E731
     return [StepMetric(tuple(names), flat, ends=True)] if names else []
 

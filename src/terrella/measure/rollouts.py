@@ -9,7 +9,7 @@ import torch
 from ..core.errors import DatasetError
 from ..core.policy import Idle, Policy, Replay, act
 from ..core.state import State
-from ..core.world import Observation, World, going_on
+from ..core.world import Observation, World, without_end
 from .clips import Clip, evidence
 from .scorecard import IDLE, OTHERS, TRUE
 
@@ -24,7 +24,7 @@ class StepMetric:
     channels: tuple[str, ...]  # to render
     # (observation, clips, row of the clips, step from 1) -> name -> [B, ...]
     measure: Callable[[Observation, Sequence[Clip], int, int], Mapping[str, torch.Tensor]]
-    ends: bool = False  # the rollout stands still after an end that the world predicts; else it goes on as the clips do
+    ends: bool = False  # all stand still after an end that the world predicts; else the rollout goes on as the clips do
 
 
 def fold_context(world: World, clips: Sequence[Clip], rng: torch.Generator) -> State:
@@ -81,7 +81,7 @@ def dream(
             state = world.observe({"pose": poses_at(clips, row)}, state, rng)
         else:
             action, memory = act(policy, seen, memory, len(clips), world.spec, rng)
-            state = world.imagine(state if ends else going_on(state), action, rng)
+            state = world.imagine(state if ends else without_end(state), action, rng)
         seen = {name: tensor.cpu() for name, tensor in world.render(state, channels).items()}
         for metric in metrics:
             for name, value in metric.measure(seen, clips, row, step).items():

@@ -13,7 +13,7 @@ import torch
 from ..core.policy import Policy, Random, act
 from ..core.spec import chance_error, measured_trust, trust_level
 from ..core.state import State
-from ..core.world import World, going_on, make_rng
+from ..core.world import World, make_rng
 from .clips import Clip, evidence
 from .exam import CLIPS, LONG, Exam, ExamResults, Probe
 from .rollouts import Results, StepMetric, rows_at
@@ -63,21 +63,26 @@ def forecast_trust(
 ) -> TrustForecast | None:
     """How many steps from `state` (default: 8 starts of the world) can be trusted, of at most `limit`, under a policy (default:
     held random actions) that is shown nothing; never more than the measured horizon of the world's card (`trust_steps_measured`),
-    where it has one. None for a world that expects no error, or the same at every step."""
+    where it has one. Steps after an end that the world predicts do not count. None for a world that expects no error, or always the
+    same."""
     chance, rng = chance_error(world.spec), make_rng(seed)
     if not math.isfinite(chance) or limit < 1:
         return None
     state = world.start(min(ROLLOUTS, world.spec.max_batch or ROLLOUTS), rng) if state is None else state
     policy = Random(world.spec, HOLD) if policy is None else policy
-    memory, expected = policy.begin(state.batch, rng), []
+    memory, expected, going = policy.begin(state.batch, rng), [], torch.ones(state.batch, dtype=torch.bool)
     for _ in range(limit):
         action, memory = act(policy, {}, memory, state.batch, world.spec, rng)
-        state = world.imagine(going_on(state), action, rng)
-        expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float().mean()))
+        state = world.imagine(state, action, rng)
+        expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float()[going].mean()))
+        going &= ~state["done"] if "done" in state else going
+        if not going.any():
+            break
     if limit > 1 and max(expected) == min(expected):
         return None
     level = trust_level(expected[0], chance)
     steps, most = steps_within(torch.tensor(expected), level), measured_trust(world.spec)
+    steps = limit if steps == len(expected) else steps
     if most is not None and most < steps:
         return TrustForecast(most, limit, level, tuple(expected), True)
     return TrustForecast(steps, limit, level, tuple(expected))

@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 
 from ..core.spec import Spec
-from ..core.world import World, going_on
+from ..core.world import World, without_end
 from ..space.camera import yaw
 from ..space.matching import scroll_index
 from .clips import Clip
@@ -56,7 +56,7 @@ def scrolling_actions(
         state, frames = first, []
         for step in range(TRIAL_STEPS + 1):
             if step:
-                state = world.imagine(going_on(state), action.expand(len(clips), *action.shape), rng)
+                state = world.imagine(without_end(state), action.expand(len(clips), *action.shape), rng)
             frames.append(world.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).contiguous())
         scrolls = [moves[scroll_index(*pair, moves)] for pair in zip(frames, frames[1:])]
         steps = torch.stack(scrolls).float().sum(0) / TRIAL_STEPS
@@ -99,7 +99,7 @@ def _turn_rates_by_trial(
     for action in actions:
         state = first
         for _ in range(TRIAL_STEPS):
-            state = world.imagine(going_on(state), action.expand(1, *action.shape), rng)
+            state = world.imagine(without_end(state), action.expand(1, *action.shape), rng)
         seen = [world.render(each, ("pose",))["pose"].float().cpu() for each in (first, state)]
         turned.append(_angle(yaw(seen[1]) - yaw(seen[0]))[0] / TRIAL_STEPS)
     return torch.stack(turned)

@@ -133,7 +133,8 @@ def _steps(numbers: Sequence[float]) -> str:
 
 
 def _traits(card: Scorecard, arm: str) -> Iterable[str]:
-    """Whether it obeys, remembers, stays sharp, keeps moving, holds still; nothing for what was not measured."""
+    """Whether it obeys, remembers, stays sharp, keeps moving, holds still, ends episodes too early; nothing for what was not
+    measured."""
     mine = [row for row in card.rows if row.arm == arm and not row.void and math.isfinite(row.figure.value)]
     sharp = [row for row in mine if (row.what, row.motion) == ("sharpness", PREDICTED) and row.probe == "pixels"]
     main = {row.channel for row in sharp[:1]}
@@ -188,7 +189,7 @@ def _moves(row: Row) -> tuple[int, str]:
 
 def _ends(row: Row) -> tuple[int, str]:
     rank = int(row.figure.value > EARLY_SHARE) + int(row.figure.low > EARLY_SHARE)
-    return rank, ("ends in time", "may end too early", "ends too early")[rank]
+    return rank, ("seldom ends too early", "may end too early", "ends too early")[rank]
 
 
 def _stands(row: Row) -> tuple[int, str]:

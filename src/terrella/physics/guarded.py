@@ -15,7 +15,7 @@ from ..core import chance
 from ..core.errors import TerrellaError
 from ..core.spec import kind_of, neutral_action, torch_dtype_of
 from ..core.state import State
-from ..core.world import Leaping, Observation, World, make_rng
+from ..core.world import Leaping, Observation, World, make_rng, without_end
 from .judge import Judge, Judged
 from .system import PhysicalSystem
 from .tolerance import Tolerance
@@ -251,7 +251,7 @@ class Guarded:
         far = world.leap(bare, action[:, None].expand(-1, steps, *action.shape[1:]), rng)
         near = bare
         for _ in range(steps):
-            near = world.imagine(near, action, rng)
+            near = world.imagine(without_end(near), action, rng)
         ends = [world.render(end, ("latent",))["latent"].double() for end in (far, near)]
         return (ends[0] - ends[1]).square().mean(-1).sqrt().cpu()
 

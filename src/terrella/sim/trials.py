@@ -11,7 +11,7 @@ from ..core.policy import Policy, observed_channels
 from ..core.rollouts import rollout
 from ..core.spec import Spec, neutral_action
 from ..core.state import State
-from ..core.world import World, going_on, make_rng
+from ..core.world import World, make_rng, without_end
 from .mujoco_world import MujocoWorld
 from .wrapper import unwrapped
 
@@ -95,4 +95,4 @@ def with_joints(world: World, state: State, past: torch.Tensor, qpos: torch.Tens
     for step in range(past.shape[1]):
         state = world.imagine(state, past[:, step], rng)
     held = dict(fitted_simulator(world).with_joints(state, state, qpos, qvel).items())
-    return going_on(state.replace(**held))
+    return without_end(state.replace(**held))

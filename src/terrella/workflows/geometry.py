@@ -14,7 +14,7 @@ from ..core.errors import DatasetError, TerrellaError
 from ..core.numbers import check_seed
 from ..core.spec import chance_error, measured_trust
 from ..core.state import State
-from ..core.world import World, going_on, make_rng
+from ..core.world import World, make_rng, without_end
 from ..data import split
 from ..measure.clips import Clip, clips_from_cache, evidence
 from ..measure.geometry import (
@@ -181,7 +181,9 @@ def _dreamt(world: World, clips: Sequence[Clip], steps: int, rng: torch.Generato
     """States of rollouts under recorded actions, the start first, and the errors that the world expects [n, steps]."""
     states, expected = [fold_context(world, clips, rng)], []
     for number in range(steps):
-        states.append(world.imagine(going_on(states[-1]), actions_at(world, clips, clips[0].context - 1 + number), rng))
+        states.append(
+            world.imagine(without_end(states[-1]), actions_at(world, clips, clips[0].context - 1 + number), rng)
+        )
         expected.append(world.render(states[-1], ("uncertainty",))["uncertainty"].cpu())
     return states, torch.stack(expected, 1)
 
@@ -193,7 +195,7 @@ def _stepper(world: LatentWorld, clips: Sequence[Clip], states: Sequence[State],
         batch, many, size = windows.shape
         state = states[number].fork(many)
         shape = state["window"].shape
-        state = going_on(state.replace(window=windows.reshape(shape).to(world.device)))
+        state = without_end(state.replace(window=windows.reshape(shape).to(world.device)))
         action = actions_at(world, clips, clips[0].context - 1 + number).repeat_interleave(many, 0)
         return world.imagine(state, action, rng)["window"].reshape(batch, many, size).cpu()
 

@@ -12,7 +12,7 @@ from PIL import Image
 
 from ..act.planning import PlayedEpisode, distance
 from ..core.files import write_json
-from ..core.world import make_rng
+from ..core.world import make_rng, without_end
 from ..measure.plan_page import compute_chart, film, film_strip, plan_page
 from ..measure.policy_evaluation import percent
 from ..measure.statistics import Figure
@@ -167,7 +167,7 @@ def _film(
     state = study.world.observe({name: seen[0][name][None] for name in study.sees}, None, rng)
     for action in [*episode.actions, None]:
         dream.append({name: value[0].cpu() for name, value in study.world.render(state, shown).items()})
-        state = state if action is None else study.world.imagine(state, action[None], rng)
+        state = state if action is None else study.world.imagine(without_end(state), action[None], rng)
     divergence = {}
     for name in names:
         one, other = (torch.stack([frame[name] for frame in frames]) for frames in (seen, dream))

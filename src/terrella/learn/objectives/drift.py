@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ...core.world import going_on, make_rng
+from ...core.world import make_rng, without_end
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
 from ...worlds.uncertainty import UncertaintyNetwork, UncertaintyProbe, input_maps, placed, situation_of
@@ -83,7 +83,7 @@ def drift_frames(
         state = dreamer.observe(recording.evidence(dreamer.config, begins + row), state, chance)
     for step in range(1, horizon + 1):
         rows = begins + shown - 1 + step
-        state = dreamer.imagine(going_on(state), recording.recorded_actions(dreamer.spec, rows - 1), chance)
+        state = dreamer.imagine(without_end(state), recording.recorded_actions(dreamer.spec, rows - 1), chance)
         drawn = dreamer.render(state, ("rgb",))["rgb"].cpu().permute(0, 3, 1, 2).float()
         if step in looks:
             error = (drawn - recording.rgb(rows).float()).abs().mean((1, 2, 3)) / 255

@@ -21,7 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from ...core.errors import DatasetError
 from ...core.files import replacing
-from ...core.world import Observation, going_on, make_rng
+from ...core.world import Observation, make_rng, without_end
 from ...worlds.generator import Conditioning
 from ...worlds.learned import LearnedWorld
 from ...worlds.parts import newest_frame
@@ -233,7 +233,7 @@ def dream(world: LearnedWorld, recording: Recording, rollout: DreamSettings, num
         if posed:
             state = dreamer.observe({"pose": recording.pose(rows)}, state, chance)
         else:
-            state = dreamer.imagine(going_on(state), recording.recorded_actions(dreamer.spec, rows - 1), chance)
+            state = dreamer.imagine(without_end(state), recording.recorded_actions(dreamer.spec, rows - 1), chance)
         drawn = newest_frame(state).cpu().float() / 255
         maps, situation = inputs.pop()
         off = (drawn - recording.rgb(rows).float() / 255).abs().mean(1)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ...core.errors import DatasetError, TrainingError
-from ...core.world import going_on, make_rng
+from ...core.world import make_rng, without_end
 from ...worlds.body import MotionBody
 from ...worlds.folder import load_world
 from ...worlds.keyframe_scene import KeyframeScene
@@ -125,7 +125,7 @@ def frame_errors(world: LearnedWorld, recording: Recording) -> dict[str, float]:
             state = world.observe(recording.evidence(world.config, first + ahead + 1), state, rng)
         last = recording.rgb(rows).float()
         for step in range(1, max(HORIZONS) + 1):
-            state = world.imagine(going_on(state), recording.recorded_actions(world.spec, rows + step - 1), rng)
+            state = world.imagine(without_end(state), recording.recorded_actions(world.spec, rows + step - 1), rng)
             if step in HORIZONS:
                 truth = recording.rgb(rows + step).float()
                 apart = newest_frame(state).cpu().float() - truth
