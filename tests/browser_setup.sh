@@ -16,9 +16,9 @@ END
 if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null 2>&1; then
     echo "installing Debian's chromium for the browser tests (once)"
     export DEBIAN_FRONTEND=noninteractive
-    apt-get install -qq -y --no-install-recommends chromium >/dev/null 2>&1 && exit 0
+    apt-get -o DPkg::Lock::Timeout=300 install -qq -y --no-install-recommends chromium >/dev/null 2>&1 && exit 0
     apt-get update -qq >/dev/null 2>&1
-    apt-get install -qq -y --no-install-recommends chromium >/dev/null 2>&1 && exit 0
+    apt-get -o DPkg::Lock::Timeout=300 install -qq -y --no-install-recommends chromium >/dev/null 2>&1 && exit 0
 fi
 echo "installing Playwright's own Chromium for the browser tests (once)"
 timeout 600 "$python" -m playwright install chromium >/dev/null 2>&1 && exit 0

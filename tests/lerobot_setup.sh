@@ -14,6 +14,6 @@ python3 -m venv --clear "$folder" >&2 &&
     pip "datasets>=4,<5" "av<16" "huggingface-hub<0.36" jsonlines einops "opencv-python-headless<4.13" pillow \
         draccus==0.10.0 termcolor deepdiff "imageio[ffmpeg]" accelerate "diffusers<0.36" "pyserial<4" gymnasium \
         numba &&
-    { command -v ffmpeg >/dev/null || apt-get install -y -q ffmpeg >&2; } &&
+    { command -v ffmpeg >/dev/null || apt-get -o DPkg::Lock::Timeout=300 install -y -q ffmpeg >&2; } &&
     touch "$folder/.ready" && echo "$python" && exit 0
 echo "SKIPPED: no environment with lerobot 0.4.4 could be made in $folder; the tests against it are not run." >&2
