@@ -6,7 +6,6 @@ import torch
 from tests.learn.graph_stand_in import distant, stand_in
 from torch import nn
 
-from terrella.learn.devices import Captured
 from terrella.learn.learners import Ema
 from terrella.learn.muon import muon
 from terrella.learn.update import Update
@@ -75,27 +74,3 @@ def test_a_first_update_without_memory_is_no_warm_up(monkeypatch):
         other.take(number, False)
     assert_same(one, other)
     assert graphs.made == 1
-
-
-def test_a_captured_function_sees_weights_shapes_and_numbers(monkeypatch):
-    graphs, net = stand_in(monkeypatch), nn.Linear(4, 2).requires_grad_(False)
-
-    def function(one, nothing, other, times):
-        return net(one) * times + other.sum()
-
-    fast = Captured(function)
-    for size, times in ((3, 2), (3, 2), (3, 5), (6, 2), (3, 2)):
-        given = (torch.randn(size, 4), None, torch.randn(size), times)
-        net.weight.add_(0.1)
-        expected = function(*given)
-        made = fast(distant(given[0]), None, given[2], times).as_subclass(torch.Tensor)
-        torch.testing.assert_close(made, expected)
-    assert graphs.made == 4  # the graphs of three rows went when six came
-
-
-def test_a_function_that_waits_runs_as_it_is(monkeypatch):
-    stand_in(monkeypatch)
-    fast = Captured(lambda one: one * one.sum().item())
-    with pytest.warns(UserWarning, match="drawn kernel by kernel"):
-        assert fast(distant(torch.ones(2))).tolist() == [2, 2]
-    assert fast(distant(torch.ones(3))).tolist() == [3, 3, 3]

@@ -21,6 +21,7 @@ from terrella.learn.objectives.flow_frames import (
     BLIND,
     DRAFTS,
     PAST,
+    RECORDED,
     WHOLE,
     EarlierFrames,
     FlowClipMaker,
@@ -197,6 +198,21 @@ def test_a_still_picture_costs_nothing_before_training_whatever_the_noise_on_its
     still = torch.randint(0, 256, (8, 1, 3, 16, 16), dtype=torch.uint8, generator=make_rng(0)).expand(-1, 3, -1, -1, -1)
     (loss,) = FlowFrames(network, 5e-3, 1, 4.0).losses(FlowClips(still, torch.zeros(8, 3, 1), None), step())
     assert float(loss.value.detach()) == 0
+
+
+@pytest.mark.parametrize(("share", "late"), [(0.0, False), (0.0, True), (0.9, True)])
+def test_a_rollout_goes_on_with_what_is_drawn_in_half_of_the_clips(share, late, monkeypatch):
+    """The network adds 20 of 255 to the last frame; the recorded frames are black."""
+    network = FlowNetwork(FlowConfig((16, 16), 2, 36 + 2, channels=(16, 16, 16)))
+    network.output.bias.data[:] = 20 / 127.5
+    objective, seen = FlowFrames(network, 5e-3, 3, 4.0), []
+    encode = objective._encode
+    monkeypatch.setattr(objective, "_encode", lambda frames, *rest: (seen.append(frames), encode(frames, *rest))[1])
+    clips = FlowClips(torch.zeros(8, 5, 3, 16, 16, dtype=torch.uint8), torch.zeros(8, 5, 1), None)
+    list(objective.losses(clips, step(share, RECORDED if late else 0)))
+    shown = [((frames[:, :, 0, 0, 0] + 1) * 127.5).round().int().tolist() for frames in seen]
+    drawn = [[[0, 0], [20, 0], [40, 20]][at] for at in range(3)]
+    assert shown == [[one if late else [0, 0]] * 4 + [[0, 0]] * 4 for one in drawn]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9])

@@ -11,7 +11,6 @@ import torch
 from torch._functorch import config as functorch_config
 
 from ..core.errors import TrainingError, is_out_of_memory, reason_of
-from ..worlds.step_program import Run, captured
 
 BUSY = 1.5  # processes that run, for each core, from which a machine is busy
 
@@ -60,42 +59,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-class Captured:
-    """A function of tensors and numbers that gives a tensor, without gradients. On a CUDA device it is captured as a CUDA graph for
-    each shape of its tensors; where that fails, it runs as it is, which a warning says."""
-
-    def __init__(self, function: Callable[..., torch.Tensor]):
-        self._function, self._fails = function, False
-        self._graphs: dict[Any, Run] = {}
-
-    def __call__(self, *given: Any) -> torch.Tensor:
-        tensors = [each for each in given if isinstance(each, torch.Tensor)]
-        if self._fails or tensors[0].device.type != "cuda":
-            return self._function(*given)
-        parts = tuple(each.shape if isinstance(each, torch.Tensor) else each for each in given)
-        key = (torch.is_autocast_enabled("cuda"), *parts)
-        if key not in self._graphs:
-            same = tensors[0].shape  # graphs of other batches keep their memory
-            self._graphs = {other: graph for other, graph in self._graphs.items() if other[1] == same}
-            try:
-                self._graphs[key] = captured(lambda fixed: [self._function(*_filled(given, fixed))], tensors)
-            except RuntimeError as error:
-                if is_out_of_memory(error):
-                    raise
-                warnings.warn(
-                    f"CUDA graphs fail here ({reason_of(error)}): pictures are drawn kernel by kernel.", stacklevel=2
-                )
-                self._fails = True
-                return self._function(*given)
-        return self._graphs[key](tensors)[0]
-
-
-def _filled(given: tuple[Any, ...], tensors: list[torch.Tensor]) -> Iterator[Any]:
-    """`given` with these tensors in the places of its own."""
-    following = iter(tensors)
-    return (next(following) if isinstance(each, torch.Tensor) else each for each in given)
 
 
 class Compiled:

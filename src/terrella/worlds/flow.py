@@ -209,7 +209,6 @@ class FlowNetwork(nn.Module):
         """The next frame [B, 3, H, W] in -1..1, drawn from `noise` of that shape in `steps` steps. kept uint8
         [B, K, 3, H, W], kept_keys [B, K, n]: earlier frames (space/recall.py). The rest: as in `encode`."""
         seen = self.encode(frames, context, scroll, memory)
-        agreed = self.blend or (lambda x: x)  # after each step, as in MultiDiffusion (Bar-Tal et al. 2023)
         noise = noise if self.blend is None else self.blend.noise(noise)
         when = times_of(steps, self.config.recalls)
         times = self.time(constant(_waves_of_times, noise.device, when))
@@ -219,8 +218,20 @@ class FlowNetwork(nn.Module):
             if step == 1 and kept is not None and kept_keys is not None:
                 seen = self.recalling(seen, kept, kept_keys, x)
             noisy = torch.lerp(noise, x.clamp(-1, 1), time) if time else seen.base
-            x = agreed(self._cleaned(seen, noisy, [(scale[:, step], shift[:, step]) for scale, shift in whole]))
-        x = torch.where(_alike(x, seen.base, STAYS), seen.base, x)
+            x = self._agreed(self._cleaned(seen, noisy, [(scale[:, step], shift[:, step]) for scale, shift in whole]))
+        return self._settled(x, seen.base, memory)
+
+    def shown(self, x: torch.Tensor, seen: FlowFeatures, memory: torch.Tensor | None) -> torch.Tensor:
+        """The frame [B, 3, H, W] that is shown where `clean` gives x."""
+        return self._settled(self._agreed(x), seen.base, memory)
+
+    def _agreed(self, x: torch.Tensor) -> torch.Tensor:
+        """After each drawing step the cameras are made to agree, as in MultiDiffusion (Bar-Tal et al. 2023)."""
+        return x if self.blend is None else self.blend(x)
+
+    def _settled(self, x: torch.Tensor, base: torch.Tensor, memory: torch.Tensor | None) -> torch.Tensor:
+        """x with the colours of the base, or of memory, where it hardly differs from them."""
+        x = torch.where(_alike(x, base, STAYS), base, x)
         if memory is not None:
             known = plus(-1.0, memory[:, :3], 1 / 127.5)
             x = torch.where(_alike(x, known, RECALLED) & (memory[:, 3:] > 0), known, x)

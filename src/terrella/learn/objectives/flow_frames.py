@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from ...space.recall import EMPTY, KEPT, keys_of
 from ...worlds.controls import Controls
 from ...worlds.flow import LATEST, FlowFeatures, FlowNetwork, carry
 from ...worlds.generator import channels_last, context_thumbnail, pixels
-from ..devices import Captured, Compiled
+from ..devices import Compiled
 from ..learners import Ema, warmup_cosine
 from ..losses import PatchCritic, critic_learner, scaled_pull
 from ..moves import StitchedEpisodes
@@ -157,7 +157,6 @@ class FlowFrames:
         self.generator = channels_last(network)
         self._encode, self._clean = self.generator.encode, self.generator.clean
         self.smooth = Ema(self.generator, 0.995)
-        self._sample = self.smooth.module.sample
         self.modules = {"generator": self.generator, "smooth": self.smooth}
         rate = warmup_cosine(learning_rate, WARMUP // rollout, 0.02)
         self.learners = {"generator": muon((self.generator,), rate, (self.generator.output,), self.smooth)}
@@ -166,11 +165,10 @@ class FlowFrames:
             self.modules["critic"], self.learners["critic"] = self.critic, critic_learner(self.critic)
 
     def compile(self) -> None:
-        """Has both halves of the network compiled at their first call, and drawing captured as a CUDA graph."""
+        """Has both halves of the network compiled at their first call."""
         self._encode, self._clean = Compiled(self.generator.encode), Compiled(self.generator.clean)
         if self._teacher is not None:
             self._teacher = Compiled(self._teacher[0]), Compiled(self._teacher[1])
-        self._sample = Captured(self.smooth.module.sample)
 
     def losses(self, batch: FlowClips, now: TrainStep) -> Iterator[Loss]:
         slots = self.generator.config.slots
@@ -187,13 +185,14 @@ class FlowFrames:
             scroll = None
             if self.generator.scrolling is not None:
                 scroll = scroll_index(shown[:, 0], truth, self.generator.moves)
-            yield from self._losses(shown, context, memory, scroll, kept, truth, before, now)
-            count = half if step + 1 < recorded.shape[1] else 0
-            drawn = self._drawn(shown[:count], context, scroll, memory, kept, now) if count else truth[:0]
-            shown = torch.cat([torch.cat([drawn, truth[count:]])[:, None], shown[:, :-1]], 1)
+            drawn = yield from self._losses(shown, context, memory, scroll, kept, truth, before, now)
+            shown = torch.cat([torch.cat([drawn[:half], truth[half:]])[:, None], shown[:, :-1]], 1)
 
-    def _losses(self, shown, context, memory, scroll, kept, truth, before, now: TrainStep) -> Iterator[Loss]:
-        """The losses of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before."""
+    def _losses(
+        self, shown, context, memory, scroll, kept, truth, before, now: TrainStep
+    ) -> Generator[Loss, None, torch.Tensor]:
+        """The losses of the frames `truth` (uint8 [B, 3, H, W]), which follow those `shown`; `before`: the recorded ones before.
+        Returns what was drawn, uint8 [B, 3, H, W]: of chance it knows the truth, by x_t, so that a rollout goes on as it does."""
         batch, network = len(truth), self.generator
         clean, frames = truth.float() / 127.5 - 1, shown.float() / 127.5 - 1
         base, was = frames[:, 0], before.float() / 127.5 - 1
@@ -211,7 +210,7 @@ class FlowFrames:
         samples = now.share >= DRAFTS
         if not samples and kept is None:
             yield Loss("generator", parts["draft"], parts)
-            return
+            return self._frames(draft, seen, memory)
         t = LATEST * now.rand(batch)
         if kept is not None:  # at later times x_t shows more than memory does
             seen = network.recalling(seen, kept[0], kept[1], draft.detach())
@@ -225,12 +224,18 @@ class FlowFrames:
         loss = parts["draft"] + parts["drawn"]
         if self.critic is None or not samples:
             yield Loss("generator", loss, parts)
-            return
+            return self._frames(drawn, seen, memory)
         last = seen.base, seen.base - seen.older
         pull = self._pull(self.critic, drawn.detach(), last, t > 0, now)
         yield Loss("generator", loss + scaled_pull(drawn, loss, pull, CRITIC_WEIGHT), parts)
         hinge = self._hinge(self.critic, clean, drawn.detach(), last, t > 0, now)
         yield Loss("critic", hinge, {"critic": hinge})
+        return self._frames(drawn, seen, memory)
+
+    @torch.no_grad()
+    def _frames(self, drawn, seen: FlowFeatures, memory) -> torch.Tensor:
+        """The frames uint8 [B, 3, H, W] that are shown of those `drawn`."""
+        return pixels(self.generator.shown(drawn, seen, memory).float())
 
     def _pull(self, critic: PatchCritic, drawn, last, sampled, now: TrainStep) -> torch.Tensor:
         """The gradient by the frames `drawn` [B, 3, H, W] by which those that are `sampled` (bool [B]) look less recorded."""
@@ -275,24 +280,3 @@ class FlowFrames:
         """Stops training of the scroll predictor, here and in the average."""
         if self.generator.scrolling is not None:
             self.smooth.module.scrolling.load_state_dict(self.generator.scrolling.requires_grad_(False).state_dict())
-
-    @torch.no_grad()
-    def _drawn(self, shown, context, scroll, memory, kept, now: TrainStep) -> torch.Tensor:
-        """Frames uint8 [B, 3, H, W] that follow the B histories `shown` by the true scroll, drawn by the averaged weights in 1 step
-        or more."""
-        network, batch = self.smooth.module, len(shown)
-        most = network.config.steps if now.share > DRAFTS else 1 + network.config.recalls
-        steps = 1 + int(now.rng.integers(most))
-        scroll, memory = (None if each is None else each[:batch] for each in (scroll, memory))
-        noise = now.randn(batch, 3, *network.config.size)
-        with now.half():
-            drawn = self._sample(
-                shown.float() / 127.5 - 1,
-                context[:batch],
-                scroll,
-                memory,
-                noise,
-                steps,
-                *(each[:batch] for each in kept or ()),
-            )
-        return pixels(drawn.float())
