@@ -107,8 +107,8 @@ def test_the_verdict_comes_first(card, clips):
     [
         ({"recorded": 4, "new": 1}, None),
         ({"recorded": 20, "new": 20}, ", ends too early"),
-        ({"recorded": 6, "new": 1}, ", may end too early, seldom ends too early in new places"),
-        ({"recorded": 1, "new": 20}, ", seldom ends too early, ends too early in new places"),
+        ({"recorded": 6, "new": 1}, ", may end too early, does not clearly end too early in new places"),
+        ({"recorded": 1, "new": 20}, ", does not clearly end too early, ends too early in new places"),
     ],
 )
 def test_the_verdict_names_worlds_that_end_too_early(card, shares, words):

@@ -65,17 +65,19 @@ def test_the_level_is_half_way_to_chance():
 
 
 class Ending(Fading):
-    """Rollouts end after 30 steps, but for every third; after an end it expects an error of 1."""
+    """Rollouts end after `last` steps, but for every third; after an end it expects an error of 1."""
+
+    last = 30
 
     def imagine(self, state, action, rng):
         step = state["step"] + 1
-        return State({"step": step, "done": (step >= 30) & (state["which"] > 0), "which": state["which"]})
+        return State({"step": step, "done": (step >= self.last) & (state["which"] > 0), "which": state["which"]})
 
     def start(self, batch, rng):
         return State({"step": torch.zeros(batch), "which": torch.arange(batch) % 3})
 
     def render(self, state, channels):
-        over = (state["step"] > 30) & (state["which"] > 0)
+        over = (state["step"] > self.last) & (state["which"] > 0)
         seen = {**super().render(state, channels), "uncertainty": torch.where(over, 1.0, 0.001 * state["step"])}
         return {name: seen[name] for name in channels}
 
@@ -86,6 +88,13 @@ def test_steps_after_a_predicted_end_do_not_count():
         forecast = forecast_trust(Ending(), 50, state)
         assert forecast is not None and (forecast.steps, forecast.ends) == (50, False)
         assert len(forecast.expected) == steps and max(forecast.expected) == pytest.approx(0.001 * steps)
+
+
+def test_where_all_end_at_once_nothing_speaks_against_more_steps():
+    world = Ending()
+    world.last = 1
+    forecast = forecast_trust(world, 50, world.start(6, make_rng(0)).at([1, 2]))
+    assert forecast is not None and (forecast.steps, len(forecast.expected)) == (50, 1)
 
 
 def test_the_forecast_is_where_the_expected_error_reaches_the_level():

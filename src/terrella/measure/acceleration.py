@@ -62,7 +62,7 @@ def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, se
     rng, names = make_rng(seed), list(world.spec.observes)
     truth = real.start(episodes, rng)
     first = real.render(truth, names)
-    state, gains = world.observe(first, None, rng), []
+    state, gains, over = world.observe(first, None, rng), [], torch.zeros(episodes, dtype=torch.bool)
     low, high = (torch.as_tensor(limit).float() for limit in real.spec.action_limits)
     for _ in range(steps):
         action = low + (high - low) * torch.rand(episodes, *low.shape, generator=rng)
@@ -73,5 +73,6 @@ def usable_horizon(world: World, real: World, steps: int, episodes: int = 64, se
             sum(((seen[name] - other[name]).float() / unit[name]).square().flatten(1).mean(1) for name in names)
             for other in (dreamt, first)
         )
-        gains.append(torch.as_tensor(held - error).masked_fill(truth["done"].bool().cpu(), 0))
+        gains.append(torch.as_tensor(held - error).masked_fill(over, 0))
+        over |= truth["done"].bool().cpu() if "done" in truth else over
     return last_step_above(torch.stack(gains, 1), torch.zeros(episodes), rng)

@@ -20,7 +20,7 @@ LEAD = (
     "its correlation with the recorded return; how well the predicted return separates stretches with more reward than usual, and "
     "the predicted end those that ended (area under the ROC curve: 1 is perfect, 0.5 is chance). Half of these stretches "
     "are from shortly before an end, if there are ends. Ends too early: the share of the clips, none of which ends, that the world "
-    "ends, which even a right world does to some where ends come by chance; their pictures are compared as if it did not."
+    "ends; their pictures are compared as if it did not. Where ends come by chance, a correct world ends some, too."
 )
 USUAL = "the usual reward"
 

@@ -31,10 +31,10 @@ LEAD = (
 class TrustForecast:
     """For how long rollouts of a world can be trusted, without a look at the truth."""
 
-    steps: int  # that are within trust; `limit` where the rollouts end before trust does
+    steps: int  # that are within trust; `limit` where the rollouts, or all of their episodes, end before trust does
     limit: int  # steps of the rollouts
     level: float  # expected error at which trust ends, in the unit of `uncertainty`
-    expected: tuple[float, ...]  # mean expected error of each step
+    expected: tuple[float, ...]  # mean expected error of each step, of the episodes that have not ended before
     measured: bool = (
         False  # whether `steps` is the measured horizon of the world's card, which is shorter than the forecast
     )
@@ -74,11 +74,11 @@ def forecast_trust(
     for _ in range(limit):
         action, memory = act(policy, {}, memory, state.batch, world.spec, rng)
         state = world.imagine(state, action, rng)
-        expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float()[going].mean()))
-        going &= ~state["done"] if "done" in state else going
+        expected.append(float(world.render(state, ("uncertainty",))["uncertainty"].float().cpu()[going].mean()))
+        going &= ~state["done"].bool().cpu() if "done" in state else going
         if not going.any():
             break
-    if limit > 1 and max(expected) == min(expected):
+    if len(expected) > 1 and max(expected) == min(expected):
         return None
     level = trust_level(expected[0], chance)
     steps, most = steps_within(torch.tensor(expected), level), measured_trust(world.spec)

@@ -189,7 +189,7 @@ def _moves(row: Row) -> tuple[int, str]:
 
 def _ends(row: Row) -> tuple[int, str]:
     rank = int(row.figure.value > EARLY_SHARE) + int(row.figure.low > EARLY_SHARE)
-    return rank, ("seldom ends too early", "may end too early", "ends too early")[rank]
+    return rank, ("does not clearly end too early", "may end too early", "ends too early")[rank]
 
 
 def _stands(row: Row) -> tuple[int, str]:

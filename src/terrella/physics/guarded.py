@@ -247,7 +247,7 @@ class Guarded:
         world, rng = self.world, make_rng(0)
         if not isinstance(world, Leaping) or not world.spec.leap:
             raise TerrellaError(f"{world.spec.name} has no leaps to compare with single steps.")
-        steps, bare = world.spec.leap, _bare(state)
+        steps, bare = world.spec.leap, without_end(_bare(state))
         far = world.leap(bare, action[:, None].expand(-1, steps, *action.shape[1:]), rng)
         near = bare
         for _ in range(steps):
